@@ -31,9 +31,7 @@ def test_the_package_is_installed_from_git_with_pip_and_its_problems_come_with_i
     table = _run(tools / "koopmpc", "run", "pendulum:upright", *chosen, within=tmp_path)
     assert all(name in table for name in CONTROLLERS)
     assert len(list((tmp_path / "logs").glob("*/*.rrd"))) == len(CONTROLLERS)
-    said = _run(
-        tools / "python", "-c", "from koopmpc.base.errors import install; print(install('video'))", within=tmp_path
-    )
+    said = _run(tools / "python", "-c", "import koopmpc as km; print(km.errors.install('video'))", within=tmp_path)
     assert said == "pip install 'koopmpc[video]'\n"
     found = _run(tools / "python", "-m", "pip", "install", "--dry-run", "koopmpc[video]", within=tmp_path)
     assert "Would install imageio-ffmpeg" in found  # pip adds to the koopmpc that came from git

@@ -123,19 +123,6 @@ def test_a_file_from_before_the_third_house_reads_in_a_fresh_process(opened, wha
     assert code == 0, said
 
 
-def test_every_class_that_a_room_serves_is_found_in_a_fresh_process():
-    ran = fresh(
-        "import koopmpc\n"
-        "from koopmpc.base.values import Value, class_of\n"
-        "assert not Value._kinds, 'nothing is imported yet'\n"
-        "assert class_of('TrustReport').__module__.startswith('koopmpc.validate')\n"
-        "assert class_of('Selection').__module__.startswith('koopmpc.synthesis')\n"
-        "assert class_of('Popen') is None and class_of('trust') is None\n"
-        "assert 'rerun' not in __import__('sys').modules\n"
-    )
-    assert ran.returncode == 0, ran.stderr
-
-
 def test_the_fixtures_are_small_and_listed():
     assert sum(file.stat().st_size for file in FOLDER.iterdir()) < 200_000
     listed = {*MODELS, *(f"controller {name}" for name in CONTROLLERS), "design", "run"}

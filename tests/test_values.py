@@ -295,7 +295,12 @@ def test_a_fresh_process_knows_every_class_that_a_saved_model_or_controller_may_
     values = [each for each in served if isinstance(each, type) and issubclass(each, Value)]
     names = sorted({cls.__name__ for cls in families + values if not isabstract(cls)})
     assert {"Eigenfunction", "LiftedKalman", "Feedback"} <= set(names)
-    code = f"from koopmpc.base.values import class_of; print([name for name in {names} if class_of(name) is None])"
+    names += ["TrustReport", "Selection"]
+    code = (
+        "from koopmpc.base.values import Value, class_of; import sys; assert not Value._kinds\n"
+        f"print([name for name in {names} if class_of(name) is None])\n"
+        "assert class_of('Popen') is None and class_of('trust') is None and 'rerun' not in sys.modules"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

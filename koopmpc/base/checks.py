@@ -53,19 +53,7 @@ def array(
     DataError
         The value is no array of real numbers, or holds NaN or inf.
     """
-    try:
-        raw = np.asarray(value)
-        if np.iscomplexobj(raw):
-            raise DataError(f"{name} is complex; pass real numbers")
-        if raw.dtype.kind not in "biufO" or (raw.dtype.kind == "O" and any(v is None for v in raw.flat)):
-            raise TypeError("numbers cannot be None or text")
-        result = np.array(raw, dtype=np.float64, order="C")
-    except (TypeError, ValueError, OverflowError) as error:  # an integer beyond 1e308 overflows
-        if isinstance(error, DataError):
-            raise
-        raise DataError(
-            f"{name} is not an array of numbers: got {type(value).__name__}, {error}; pass numbers of one shape"
-        ) from error
+    result = _to_floats(value, name)
     if shape is not None and shape != result.shape:
         fits = len(shape) == result.ndim and all(n is None or n == m for n, m in zip(shape, result.shape, strict=True))
         if not fits:
@@ -80,18 +68,26 @@ def array(
     return result
 
 
+def _to_floats(value: object, name: str) -> Float[np.ndarray, "..."]:
+    try:
+        raw = np.asarray(value)
+        if np.iscomplexobj(raw):
+            raise DataError(f"{name} is complex; pass real numbers")
+        if raw.dtype.kind not in "biufO" or (raw.dtype.kind == "O" and any(v is None for v in raw.flat)):
+            raise TypeError("numbers cannot be None or text")
+        return np.array(raw, dtype=np.float64, order="C")
+    except DataError:
+        raise
+    except (TypeError, ValueError, OverflowError) as error:  # an integer beyond 1e308 overflows
+        raise DataError(
+            f"{name} is not an array of numbers: got {type(value).__name__}, {error}; pass numbers of one shape"
+        ) from error
+
+
 def bounded(
     value: ArrayLike | ByName, name: str, shape: Sequence[int | None] | None = None
 ) -> Float[np.ndarray, "..."]:
-    """Return `value` as `array` does, if none of its entries is beyond 1e100.
-
-    Raises
-    ------
-    ShapeError
-        The shape differs.
-    DataError
-        As `array`, or an entry is beyond 1e100: an SVD of products that overflow may not end.
-    """
+    """Return `value` as `array` does, if none of its entries is beyond 1e100: an SVD of what overflows may not end."""
     result = array(value, name, shape)
     largest = float(np.abs(result).max(initial=0.0))
     if largest > LARGEST:
@@ -169,15 +165,7 @@ def root(P: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
 
 
 def names(given: Sequence[str] | None, what: str, letter: str, size: int) -> tuple[str, ...]:
-    """Return `size` names: those given, or ``x0, x1, …`` with this letter.
-
-    Raises
-    ------
-    DataError
-        A single text is given.
-    ShapeError
-        There are more or fewer names.
-    """
+    """Return `size` names: those given, or ``x0, x1, …`` with this letter."""
     if given is None:
         return tuple(f"{letter}{i}" for i in range(size))
     given = texts(given, what)
@@ -194,13 +182,7 @@ def distinct(*lists: Sequence[str]) -> None:
 
 
 def texts(given: object, what: str) -> tuple[str, ...]:
-    """Return a sequence of names as a tuple.
-
-    Raises
-    ------
-    DataError
-        It is a single text, or holds what is no text.
-    """
+    """Return a sequence of names as a tuple; refuse a single text, and what is no text."""
     try:
         found = tuple(cast("Iterable[object]", given))
     except TypeError:  # an array without dimensions is an Iterable too
@@ -320,13 +302,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def numbers(value: ArrayLike | None, name: str) -> Float[np.ndarray, "..."]:
-    """Return `value` as float64, itself where it is one already, for this is the control path.
-
-    Raises
-    ------
-    DataError
-        It is no array of numbers.
-    """
+    """Return `value` as float64, itself where it is one already, for this is the control path."""
     try:
         if value is not None and getattr(value, "dtype", _REAL).kind != "c":  # numpy would only warn of these
             return np.asarray(value, dtype=np.float64)
@@ -336,13 +312,7 @@ def numbers(value: ArrayLike | None, name: str) -> Float[np.ndarray, "..."]:
 
 
 def check_named(given: Any, what: str, *, infinite: bool = False) -> dict[str, float]:
-    """Return the numbers by name.
-
-    Raises
-    ------
-    DataError
-        A name is no text, or a value no number.
-    """
+    """Return the numbers by name; refuse a name that is no text, and a value that is no number."""
     wrong = next((name for name in given if not isinstance(name, str)), None)
     if wrong is not None or not given:
         raise DataError(f"{what} is {given!r}; pass names of signals with their numbers, as {{'theta': 10}}")
@@ -355,23 +325,9 @@ def list_values(given: Any) -> Any:
 
 
 def order_by_name(given: Any, what: str, names: Sequence[str], omitted: float | None) -> Float[np.ndarray, " n"]:
-    """Return the numbers in the order of the names of a plant.
+    """Return the numbers in the order of the names of a plant, whose units may be left out.
 
-    Parameters
-    ----------
-    given
-        Name → number.
-    what
-        The field, for messages.
-    names
-        Names with units.
-    omitted
-        The number of a name that is not given; None where each must be.
-
-    Raises
-    ------
-    DataError
-        A name is unknown, fits two, is given twice, or is missing.
+    `omitted` is the number of a name that is not given; None where each must be.
     """
     values: dict[int, float] = {}
     for name, value in cast("Mapping[str, float]", given).items():

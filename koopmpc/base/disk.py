@@ -16,7 +16,7 @@ from multiprocessing.util import Finalize
 from os import PathLike
 from pathlib import Path
 from typing import Any, BinaryIO, cast
-from zipfile import ZipFile, ZipInfo, is_zipfile
+from zipfile import ZipFile, is_zipfile
 
 import numpy as np
 
@@ -24,8 +24,6 @@ from koopmpc.base.errors import DataError, FullDiskError, LogError
 from koopmpc.base.interrupts import raise_swallowed
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_DEFLATED = 1100  # deflate makes a member at most 1032 times smaller
-_PIECE = 1 << 22  # bytes that are read at once
 PART = ".part"  # ends the name of a file that is being written
 
 
@@ -84,13 +82,7 @@ def writing(path: str | PathLike[str]) -> Generator[BinaryIO]:
 
 
 def target(path: str | PathLike[str]) -> Path:
-    """Return the file that is meant by `path`, behind symbolic links.
-
-    Raises
-    ------
-    LogError
-        It is a folder, or a file that may not be written.
-    """
+    """Return the file behind symbolic links; refuse a folder, and a file that may not be written."""
     file = path_of(path)
     if file.is_dir():
         raise LogError(f"{file} is a folder; pass the path of a file in it")
@@ -143,8 +135,8 @@ class _Stream(io.FileIO):
 class Members:
     """The arrays of a .npz file, each read when it is asked for; the others take no memory.
 
-    A pickle is never opened. Before an array is allocated, its size must be what its member holds, and fit into
-    memory; the checksum of a member covers all of it.
+    A pickle is never opened. Before an array is allocated, its member must fit into memory; the checksum of a member
+    covers all of it.
 
     Raises
     ------
@@ -168,8 +160,12 @@ class Members:
     def __getitem__(self, name: str) -> np.ndarray:
         """Return the array; ValueError where it is damaged or too large."""
         info = self._infos[name]
+        affordable(info.file_size, info.filename)
         with _translate_errors(), self._zip.open(info) as stream:
-            return _array(info, stream)
+            array = np.lib.format.read_array(stream, allow_pickle=False)
+            if stream.read(1):  # at the end of the member its checksum was compared
+                raise ValueError("the member goes on behind its array")
+        return array
 
     def require(self, *names: str) -> None:
         """Raise ValueError where one of these arrays is missing."""
@@ -184,47 +180,15 @@ def _translate_errors() -> Generator[None]:
     """Turn the dozen kinds of errors of zipfile and numpy, some of which advise to trust the file, into one."""
     try:
         yield
-    except _TooLargeError:
-        raise
     except Exception as error:
         raise ValueError("it is damaged, or holds something other than arrays of numbers") from error
 
 
-class _TooLargeError(ValueError):
-    """An array does not fit into memory."""
-
-
-def _array(info: ZipInfo, stream: Any) -> np.ndarray:
-    """Read one member: its header, whose size must be that of the member, then the numbers, to the checksum."""
-    version = np.lib.format.read_magic(stream)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, columns_first, dtype = read(stream)
-    size = dtype.itemsize
-    for length in shape:
-        size *= length
-    if dtype.hasobject or stream.tell() + size != info.file_size or info.file_size > _DEFLATED * info.compress_size:
-        raise ValueError("the array is not of the size of its member")
-    affordable(size, f"{info.filename} of {shape} numbers")
-    held = np.empty(size, dtype=np.uint8)
-    for start in range(0, size, _PIECE):
-        piece = stream.read(min(_PIECE, size - start))
-        held[start : start + len(piece)] = np.frombuffer(piece, dtype=np.uint8)
-    if stream.read(1):  # at the end the checksum was compared
-        raise ValueError("the member goes on behind its array")
-    return held.view(dtype).reshape(shape, order="F" if columns_first else "C") if size else np.empty(shape, dtype)
-
-
 def affordable(size: int, what: str) -> None:
-    """Raise where so many bytes do not fit into the memory that is free.
-
-    Raises
-    ------
-    ValueError
-        The message names both numbers.
-    """
+    """Raise a ValueError that names both numbers where so many bytes do not fit into the memory that is free."""
     free = memory()
     if free is not None and size > free:
-        raise _TooLargeError(f"{what} would take {size / 1e9:.3g} GB, and {free / 1e9:.3g} GB are free")
+        raise ValueError(f"{what} would take {size / 1e9:.3g} GB, and {free / 1e9:.3g} GB are free")
 
 
 def memory() -> int | None:

@@ -47,13 +47,12 @@ def attach(
         Name that users of other libraries try → what to write here.
     """
     imported = read_imports(package)
-    rooms = {name: f"koopmpc.{file}" for name, file in (modules or {}).items()}
-    rooms = {name: f"{package}.{name}" for name, file in imported.items() if file == package} | rooms
+    rooms = {name: f"{package}.{name}" for name, file in imported.items() if file == package}
+    rooms |= {name: f"koopmpc.{file}" for name, file in (modules or {}).items()}
     home = {name: file for name, file in imported.items() if name not in rooms}
-    public = sorted(home)
     waiting = [f"{package}.{file}" for file in core]
     if joints is not None:
-        _JOINTS.update({joint: tuple(f"{package}.{file}" for file in files) for joint, files in joints.items()})
+        _JOINTS.update({joint: tuple(map(f"{package}.{{}}".format, files)) for joint, files in joints.items()})
         _ROOMS[:] = [package, *dict.fromkeys(rooms.values())]
 
     @raise_swallowed()  # libraries take a Ctrl-C while they are imported for an ImportError, or a RuntimeError
@@ -61,30 +60,43 @@ def attach(
         if name in rooms or name in home:
             while waiting:
                 import_module(waiting.pop())
-            ready = {known: getattr(loaded[file], known) for known, file in home.items() if file in loaded}
-            for known in ready.keys() - loaded[package].__dict__.keys():
-                shorten_annotations(ready[known])
-            loaded[package].__dict__.update(ready)
-        if name == "__version__" and package == "koopmpc":
+            _serve_loaded(package, home)
+            value = import_module(rooms[name]) if name in rooms else getattr(import_module(home[name]), name)
+        elif name == "__version__" and package == "koopmpc":
             from importlib.metadata import version  # 10 ms, paid by who asks
 
             value = version(package)
-        elif name in rooms:
-            value = import_module(rooms[name])
-        elif name in home:
-            value = getattr(import_module(home[name]), name)
-        elif moved is not None and name in moved:
-            old = f"{package}.{name}".replace("koopmpc", "km", 1)
-            raise AttributeError(f"{old} has moved: it is km.{moved[name]}.{name} now")
         else:
-            near = [known for known in (*public, *rooms) if known.lower() == name.lower()]
-            hint = (hints or {}).get(name) or (f"it is {package.replace('koopmpc', 'km', 1)}.{near[0]}" if near else "")
-            raise AttributeError(f"module {package!r} has no attribute {name!r}" + (f"; {hint}" if hint else ""))
+            raise AttributeError(_explain_missing(package, name, [*home, *rooms], moved or {}, hints or {}))
         shorten_annotations(value)
         setattr(loaded[package], name, value)
         return value
 
-    return serve, lambda: sorted([*public, *rooms]), public
+    return serve, lambda: sorted([*home, *rooms]), sorted(home)
+
+
+def _serve_loaded(package: str, home: Mapping[str, str]) -> None:
+    """Serve the names of all files that are loaded meanwhile, without a further call."""
+    names = loaded[package].__dict__
+    for name, file in home.items():
+        value = getattr(loaded[file], name) if file in loaded else None
+        if (
+            value is not None and names.get(name) is not value
+        ):  # or the file itself, which has the same name, stands there
+            shorten_annotations(value)
+            names[name] = value
+
+
+def _explain_missing(
+    package: str, name: str, known: Sequence[str], moved: Mapping[str, str], hints: Mapping[str, str]
+) -> str:
+    """Return what to write in place of a name that the package does not have."""
+    short = package.replace("koopmpc", "km", 1)
+    if name in moved:
+        return f"{short}.{name} has moved: it is km.{moved[name]}.{name} now"
+    near = next((f"it is {short}.{other}" for other in known if other.lower() == name.lower()), "")
+    hint = hints.get(name) or near
+    return f"module {package!r} has no attribute {name!r}" + (f"; {hint}" if hint else "")
 
 
 def shorten_annotations(value: Any) -> None:
@@ -134,17 +146,8 @@ def find_public(name: str) -> Any:
 def load_joint(joint: str, until: Callable[[], bool] | None = None) -> tuple[str, ...]:
     """Import the modules that register themselves at this joint, so that a room never imports one above it.
 
-    Parameters
-    ----------
-    joint
-        A joint of the table in ``koopmpc/__init__.py``.
-    until
-        Import no further module once this is true.
-
-    Returns
-    -------
-    tuple of str
-        Names of all modules of the joint, in the order of the table.
+    Once `until` is true no further one is imported. The names of all modules are returned, in the order of the table in
+    ``koopmpc/__init__.py``.
     """
     for file in _JOINTS[joint]:
         if until is not None and until():

@@ -35,8 +35,6 @@ _AHEAD = 2  # for each worker this many tasks may be under way, or wait for thei
 _TRIES = 3  # name a task that killed its worker this many times while it ran alone
 _PATIENCE = 30.0  # raise an error if the cluster has no worker, or its scheduler no answer, for this time [s]
 _ANSWER = 10.0  # raise an error if nothing listens at the scheduler's address, or it says nothing, for this time [s]
-_LOOK = 0.5  # a worker looks this often whether its parent has ended [s]
-_SHOWN = 200  # a message shows at most this many characters of a task
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _KEEP_MODELS = {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}  # loky restarts a worker whose memory grows by more [B]
 _KILLS = ": each worker that ran it died; run it with workers=1 to see why, or give the workers more memory"
@@ -157,7 +155,7 @@ class Workers:
             while True:
                 room = (_AHEAD * self._open()[1]() if ahead is None else ahead) - len(waiting)
                 for i, task in islice(numbered, max(room, 0)):
-                    name = f"task {i}, {task!s:.{_SHOWN}}"
+                    name = f"task {i}, {task!s:.200}"
                     sent = _pickle(task, name)
                     waiting.append((name, sent, self._submit(code, sent)))
                 if not waiting:
@@ -328,13 +326,13 @@ def _pickle(value: object, name: str) -> bytes:
         ) from error
 
 
-def _watch_parent() -> None:
-    """End this worker when its parent has ended, killed perhaps: it would wait for tasks for ever."""
+def _watch_parent(*, period: float = 0.5) -> None:
+    """End this worker when its parent has ended, killed perhaps; look for that each `period` [s]."""
     parent = os.getppid()
 
     def end_with_parent() -> None:
         while os.getppid() == parent:
-            time.sleep(_LOOK)
+            time.sleep(period)
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()

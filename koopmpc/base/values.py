@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from functools import cache
 from hashlib import sha256
-from math import copysign
 from types import UnionType
 from typing import (
     Any,
@@ -124,20 +123,19 @@ def freeze(value: object, **fields: object) -> None:
 
 def same(a: Any, b: Any) -> bool:
     """Return True where two trees of values are equal to the bit."""
-    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
-        x, y = cast("Array", a), cast("Array", b)
-        return bool(x.dtype == y.dtype) and x.shape == y.shape and x.tobytes() == y.tobytes()
-    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        return False
-    if isinstance(a, float) and isinstance(b, float):
-        return (a == b and copysign(1.0, a) == copysign(1.0, b)) or (a != a and b != b)
-    if isinstance(a, tuple | list) and isinstance(b, tuple | list):
-        left, right = cast("Sequence[Any]", a), cast("Sequence[Any]", b)
-        return len(left) == len(right) and all(same(x, y) for x, y in zip(left, right, strict=True))
-    if isinstance(a, Mapping) and isinstance(b, Mapping):
-        first, second = cast("Mapping[str, Any]", a), cast("Mapping[str, Any]", b)
-        return first.keys() == second.keys() and all(same(first[k], second[k]) for k in first)
-    return bool(a == b)
+    match a, b:
+        case np.ndarray(), np.ndarray():
+            return bool(a.dtype == b.dtype) and a.shape == b.shape and a.tobytes() == b.tobytes()
+        case (np.ndarray(), _) | (_, np.ndarray()):
+            return False
+        case float(), float():
+            return a.hex() == b.hex()  # which tells −0 from 0, and no NaN from another
+        case ((tuple() | list()), (tuple() | list())):
+            return len(a) == len(b) and all(map(same, a, b))
+        case Mapping(), Mapping():
+            return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+        case _:
+            return bool(a == b)
 
 
 def to_data(value: Any, arrays: Arrays | None = None) -> Any:
@@ -261,16 +259,13 @@ def _is_a(value: Any, hint: Any) -> bool:
         return any(_is_a(value, arg) for arg in args)
     if origin is Literal:
         return not isinstance(value, np.ndarray) and value in args
-    if origin is tuple and args[-1:] != (...,):
-        items = cast("Sequence[Any]", value)
-        return isinstance(value, tuple) and len(items) == len(args) and all(map(_is_a, items, args))
     if origin in (tuple, Sequence):
-        return isinstance(value, tuple) and all(_is_a(item, args[0]) for item in cast("Sequence[Any]", value))
+        fixed = origin is tuple and args[-1:] != (...,)
+        kinds = args if fixed or not isinstance(value, tuple) else args[:1] * len(value)
+        return isinstance(value, tuple) and len(value) == len(kinds) and all(map(_is_a, value, kinds))
     if origin in (dict, Mapping):
-        if not isinstance(value, Mapping):
-            return False
-        pairs = cast("Mapping[Any, Any]", value).items()
-        return all(_is_a(key, args[0]) and _is_a(item, args[1]) for key, item in pairs)
+        parts = (tuple(value), tuple(value.values())) if isinstance(value, Mapping) else (None, None)
+        return all(map(_is_a, parts, (tuple[args[0], ...], tuple[args[1], ...])))
     if hint is Any or not isinstance(hint, type) or origin is not None:
         return True
     return isinstance(value, (float, int) if hint is float else hint)

@@ -101,13 +101,7 @@ def _bounds(
 
 
 def make_monitor(given: object, model: object) -> Monitor:
-    """Return the monitor that a controller's argument ``monitor=`` stands for, made of the data where it is Episodes.
-
-    Raises
-    ------
-    DataError
-        The controller's model was not fitted to data, or the monitor is of another lifting.
-    """
+    """Return the monitor that a controller's argument ``monitor=`` stands for; of Episodes it is made."""
     if not isinstance(model, LinearPredictor | BilinearPredictor):
         raise DataError("a monitor compares with data, and this controller's model is not learned; leave out monitor=")
     monitor = Monitor.of(model, given) if isinstance(given, Episodes) else given
@@ -126,15 +120,7 @@ class Watch:
 
     The state is compared with its prediction from the step before, with the input that the plant got, the measured
     disturbances and the estimated one.
-
-    Parameters
-    ----------
-    monitor
-        The region and the band.
-    model
-        The model that predicts.
-    latency
-        Steps until an input acts; the prediction that is compared is that of the plan's start.
+    The prediction is that of the plan's start, `latency` steps ahead, until which no input acts.
     """
 
     def __init__(self, monitor: Monitor, model: LinearPredictor | StateModel, latency: int) -> None:

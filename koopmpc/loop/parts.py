@@ -17,13 +17,7 @@ _NEEDED = ("dt", "nu", "horizon", "reset")
 
 
 class ControllerPair(Published):
-    """Two controllers of one plant, of which one acts; the second may be missing.
-
-    Raises
-    ------
-    DataError
-        One is no controller; the two have another dt or number of inputs.
-    """
+    """Two controllers of one plant, of which one acts; the second may be missing."""
 
     _PARTS = ("the controller", "the standby")
 
@@ -43,13 +37,7 @@ class ControllerPair(Published):
         return [self.controller] if self.standby is None else [self.controller, self.standby]
 
     def save_parts(self, **options: Any) -> SavedController:
-        """Return these options, and what the controllers were made of, as data.
-
-        Raises
-        ------
-        DataError
-            One of the two cannot be saved as data.
-        """
+        """Return these options, and what the controllers were made of, as data."""
         saved: dict[str, Any] = {"controller": None, "standby": None}
         for name, part in zip(saved, self._both, strict=False):
             if not isinstance(part, Published):
@@ -79,13 +67,7 @@ class ControllerPair(Published):
         return frozenset[int]().union(*map(start_sizes, self._both))
 
     def reset_parts(self, x0: ArrayLike | None, u_prev: ArrayLike | None) -> None:
-        """Begin a run with each controller; one whose model has another number of states begins without x0.
-
-        Raises
-        ------
-        ShapeError, DataError
-            x0 is no vector of finite numbers, or no model has as many states.
-        """
+        """Begin a run with each controller; one whose model has another number of states begins without x0."""
         sizes = sorted(self.start_sizes)
         start = None if x0 is None else checks.array(x0, "x0", None if sizes else (None,))
         if start is not None and sizes and start.shape not in [(size,) for size in sizes]:

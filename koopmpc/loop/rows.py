@@ -55,26 +55,15 @@ class Step:
 class MoveColumn:
     """One field of `Move` over all steps of a loop.
 
-    Attributes
-    ----------
-    absent
-        Value of a step whose move lacks the field, or has None there.
-    dtype
-        Type of the numbers in an array; None: the values stay Python objects, in a tuple.
-    log
-        Entity of a log that keeps the values which differ from `absent`, or the words where they change. Empty: the
-        writer of logs draws this column, and keeps it in a form of its own.
-    timed
-        Whether the value depends on the clock, so that a repeated run has others.
-    name
-        Name of the field, the same in `Move` and in `StepRows`.
+    `log` is the entity of a log that keeps the values which differ from `absent`, or the words where they change; if it
+    is empty, the writer of logs keeps this column in a form of its own.
     """
 
-    absent: Any
-    dtype: type | None = None
+    absent: Any  # value of a step whose move lacks the field, or has None there
+    dtype: type | None = None  # type of the numbers in an array; None: Python objects in a tuple
     log: str = ""
-    timed: bool = False
-    name: str = ""
+    timed: bool = False  # the value depends on the clock, so that a repeated run has others
+    name: str = ""  # the same in `Move` and in `StepRows`
 
     def collect(self, values: Iterable[Any]) -> Any:
         """Return the values of consecutive steps as a column."""

@@ -25,30 +25,16 @@ SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}  # in a
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class About(Value):
-    """The data of a closed loop that do not change from step to step.
+    """The data of a closed loop that do not change from step to step."""
 
-    Attributes
-    ----------
-    cost, limits
-        What the run is judged by.
-    dt
-        Sampling time [s].
-    states, inputs, outputs
-        Names with units.
-    angles
-        Indices of states whose errors wrap at ±π.
-    metadata
-        Names, numbers and lists: problem, controller, case, seeds, versions.
-    """
-
-    cost: Cost | None
+    cost: Cost | None  # what the run is judged by
     limits: Limits | None
-    dt: float
-    states: tuple[str, ...]
+    dt: float  # sampling time [s]
+    states: tuple[str, ...]  # names with units
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    angles: tuple[int, ...] = ()
-    metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    angles: tuple[int, ...] = ()  # indices of states whose errors wrap at ±π
+    metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])  # problem, controller, case, seeds, versions
 
     def __post_init__(self) -> None:
         check_judges(self.cost, self.limits)
@@ -74,13 +60,7 @@ class About(Value):
 
 
 def check_judges(cost: object, limits: object) -> None:
-    """Raise unless cost and limits are of the classes Cost and Limits, or None.
-
-    Raises
-    ------
-    DataError
-        It is of another class.
-    """
+    """Raise unless cost and limits are of the classes Cost and Limits, or None."""
     if cost is not None:
         checks.kind(cost, "cost", Cost, "pass km.Cost(Q=…, R=…), or leave it out")
     if limits is not None:

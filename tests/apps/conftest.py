@@ -4,19 +4,14 @@ from contextlib import nullcontext
 
 import pytest
 
-from koopmpc.apps.fitting.designing import design_data
-from koopmpc.apps.fitting.options import FitOptions
-from tests.apps.mass import GOAL, logs
+from tests.apps.mass import design
 from tests.small_designs import small_designs, undrawn_pages
 
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("designed")
-    logs().save(folder / "logs.npz")
-    (folder / "goal.toml").write_text(GOAL)
     with small_designs(), undrawn_pages():
-        return design_data(folder / "logs.npz", folder / "goal.toml", folder / "out", FitOptions(linear=True))
+        return design(tmp_path_factory.mktemp("designed"))
 
 
 @pytest.fixture(autouse=True)

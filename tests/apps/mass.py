@@ -3,6 +3,8 @@
 import numpy as np
 
 import koopmpc as km
+from koopmpc.apps.fitting.designing import DesignedData, design_data
+from koopmpc.apps.fitting.options import FitOptions
 
 A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.005], [0.1]])
 NAMES = ("position [m]", "speed [m/s]"), ("force [N/kg]",)
@@ -34,3 +36,13 @@ limits = [-0.8, 0.8]
 weight = 0.01
 limits = [-2.0, 2.0]
 """
+
+
+def design(folder, goal=GOAL, data=None, **options) -> DesignedData:
+    """Return the design that `koopmpc fit` makes of these logs and this goal, of linear models by default."""
+    if data is None:
+        logs().save(data := folder / "logs.npz")
+    (folder / "goal.toml").write_text(goal)
+    (folder / "out").mkdir(exist_ok=True)
+    asked = FitOptions(**{"linear": True} | options)
+    return design_data(data, folder / "goal.toml", folder / "out", asked, print, None)

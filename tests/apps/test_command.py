@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import koopmpc as km
-from koopmpc.apps.cli.app import app
+from tests.commands import koopmpc
 
 registry = km.papers
 korda, control, settings = (
@@ -77,7 +76,7 @@ def test_every_paper_is_found_by_its_name():
 def test_an_unknown_paper_is_refused_and_the_nearest_is_suggested():
     with pytest.raises(km.errors.ProblemError, match=r"no paper 'snider', did you mean 'snyder'\?; there are snyder"):
         registry.find_paper("snider")
-    result = CliRunner().invoke(app, ["reproduce", "nobody"])
+    result = koopmpc("reproduce", "nobody")
     assert result.exit_code == 2
     assert "there is no paper 'nobody'" in result.output
 
@@ -98,7 +97,7 @@ def test_the_command_prints_verdicts_and_paths_and_fails_where_a_required_number
     paper = registry.make_paper("mine", "Mine and yours.\n\nA paper\nof ours.\n", work)
     monkeypatch.setattr(registry, "PAPERS", ("mine",))
     monkeypatch.setattr(registry, "import_module", lambda name: type("M", (), {"paper": paper}))
-    result = CliRunner().invoke(app, ["reproduce", "mine", "--logs", str(tmp_path)])
+    result = koopmpc("reproduce", "mine", "--logs", tmp_path)
     assert result.exit_code == code, result.output
     for word in ("Mine and yours", "it works", "does not hold", "half of it", "mine.md", "mine.rrd", "done in"):
         assert word in result.output
@@ -119,10 +118,10 @@ def test_all_papers_go_to_one_folder_with_a_table_of_them(tmp_path, monkeypatch)
         assert f"({each.paper}.md) | {claims} | {claims} | 0 | 0 |" in text
         assert (tmp_path / f"{each.paper}.rrd").is_file()
     assert registry.make_summary_table(found).row_count == 2
-    result = CliRunner().invoke(app, ["reproduce"])
+    result = koopmpc("reproduce")
     assert result.exit_code == 2
     assert "name one paper, or pass --all" in result.output
-    assert CliRunner().invoke(app, ["reproduce", "proctor", "--all"]).exit_code == 2
+    assert koopmpc("reproduce", "proctor", "--all").exit_code == 2
 
 
 def test_a_claim_holds_or_holds_in_part_or_fails_and_an_error_has_three_digits():

@@ -1,6 +1,7 @@
 """koopmpc fit: from logs of an unknown plant to a model file, a report, pictures and a Rerun log."""
 
 import contextlib
+import importlib
 import re
 import subprocess
 import sys
@@ -9,20 +10,11 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 import pytest
-from scipy import signal
-from typer.testing import CliRunner
 
 import koopmpc as km
-import koopmpc.apps.fitting.fit
-from koopmpc.apps.bench.store import RESULTS
-from koopmpc.apps.cli.app import app
-from koopmpc.apps.fitting.fit import fit_data
-from koopmpc.apps.fitting.logs import describe_guesses, divide_files, read_logs, shorten_notes
-from koopmpc.apps.fitting.options import FitOptions
-from koopmpc.apps.fitting.repair import find_repairs
-from koopmpc.views.figures import style
 from tests import tiers
 from tests.apps.tiny import write
+from tests.commands import koopmpc
 
 
 @dataclass(frozen=True)
@@ -74,8 +66,16 @@ def few(monkeypatch):
 @pytest.fixture
 def quick(few, monkeypatch):
     """Draw and record nothing either."""
-    monkeypatch.setattr(koopmpc.apps.fitting.fit, "list_pictures", lambda *_: [])
-    monkeypatch.setattr(koopmpc.apps.fitting.fit, "record_model", lambda *_, **__: None)
+    monkeypatch.setattr("koopmpc.apps.fitting.fit.list_pictures", lambda *_: [])
+    monkeypatch.setattr("koopmpc.apps.fitting.fit.record_model", lambda *_, **__: None)
+
+
+def fit(place, *arguments):
+    """Return the folder that `koopmpc fit` wrote, and what it printed."""
+    result = koopmpc("fit", *arguments, "--logs", place / "logs")
+    assert result.exit_code == 0, result.output
+    (folder,) = (place / "logs").iterdir()
+    return folder, result.stdout
 
 
 @pytest.fixture(scope="module")
@@ -84,8 +84,8 @@ def fitted(tmp_path_factory):
     place = tmp_path_factory.mktemp("fit")
     write_csv(cart_pole(18, steps=60), place / "csv")
     with contextlib.chdir(place), pytest.MonkeyPatch.context() as patch:
-        patch.setitem(style._RC, "savefig.dpi", 50.0)
-        result = CliRunner().invoke(app, ["fit", "csv"])
+        patch.setitem(importlib.import_module("koopmpc.views.figures.style")._RC, "savefig.dpi", 50.0)
+        result = koopmpc("fit", "csv")
     assert result.exit_code == 0, result.stderr
     (folder,) = (place / "logs").iterdir()
     return folder, result, cart_pole(12, steps=60, rng=1)
@@ -149,14 +149,11 @@ def test_the_report_is_of_episodes_that_no_fit_saw(tmp_path):
         made.append(km.Episode(X=X, U=U))
     data = km.Episodes(made, 0.1)
     data.save(tmp_path / "data.npz")
-    found = fit_data(tmp_path / "data.npz", tmp_path / "out", FitOptions(horizon=10))
-    held = {e.X.tobytes() for e in found.held_out}
-    assert len(held) == 6
-    assert held < {e.X.tobytes() for e in data}
-    assert found.selection.predictor.report.samples == 14 * 80
-    assert found.failures == ()
-    assert km.load_model(found.model) == found.selection.predictor
-    assert km.load_model(tmp_path / "out" / "linear.npz") == found.selection.linear
+    folder, said = fit(tmp_path, tmp_path / "data.npz", "--horizon", "10")
+    assert "held out  6 episodes" in said
+    assert km.load_model(folder / "model.npz").report.samples == 14 * 80
+    assert isinstance(km.load_model(folder / "linear.npz"), km.LinearPredictor)
+    assert "What could not be made" not in (folder / "report.md").read_text()
 
 
 @pytest.mark.slow
@@ -166,67 +163,18 @@ def test_what_memory_does_not_hold_is_fitted_part_by_part_on_processes(tmp_path,
     data = cart_pole(24)
     for i in range(12):
         data[2 * i : 2 * i + 2].save(tmp_path / "in" / f"{i:02d}.npz")
-    told = []
-    found = fit_data(
-        tmp_path / "in", tmp_path / "out", FitOptions(horizon=10, workers=2, linear=True), memory=1000, say=told.append
-    )
-    assert "read in 12 parts: 1 of them is held out" in told[0]
-    assert found.selection.predictor.report.samples == 22 * 40
-    rest = km.Episodes([e for e in data if e.X.tobytes() not in {h.X.tobytes() for h in found.held_out}], data.dt)
-    assert len(rest) == 22
-    best = found.selection.best
-    again = km.edmd(
-        km.Episodes(list(rest), data.dt, data.states, data.inputs), best.lifting, ridge=best.ridge, towards="affine"
-    )
-    assert pytest.approx(again.A, abs=1e-6) == found.selection.predictor.A
+    monkeypatch.setattr("koopmpc.apps.fitting.logs.IN_MEMORY", 1000)
+    folder, said = fit(tmp_path, tmp_path / "in", "--horizon", "10", "--workers", "2", "--linear")
+    assert "read in 12 parts: 1 of them is held out" in said
+    assert km.load_model(folder / "model.npz").report.samples == 22 * 40
 
 
 @pytest.mark.usefixtures("quick")
 def test_the_end_of_one_long_log_is_held_out_and_that_is_said(tmp_path):
     data = cart_pole(1, steps=500)
     write_csv(data, tmp_path / "csv")
-    told = []
-    found = fit_data(
-        tmp_path / "csv" / "00.csv", tmp_path / "out", FitOptions(horizon=10, linear=True), say=told.append
-    )
-    assert re.search(r"the last fifth of the record is held out, in \d+ blocks", told[0])
-    assert len(found.held_out) >= 4
-    last = np.concatenate([e.X[:-1] for e in found.held_out])
-    assert np.allclose(last, data[0].X[400:-1])
-
-
-def test_the_verdict_on_a_record_looks_as_far_ahead_as_its_output_remembers(tmp_path):
-    rng = np.random.default_rng(0)
-    u, tau = rng.standard_normal(6000), 60
-    y = signal.lfilter([0, 1], [1, -np.exp(-1 / tau)], u)
-    rows = np.column_stack([0.01 * np.arange(len(y)), u, y])
-    np.savetxt(tmp_path / "slow.csv", rows, delimiter=",", header="time [s],u,y", comments="")
-    split = read_logs(tmp_path / "slow.csv", None, rng, 10**9, {})
-    assert split.horizon == 20  # models are chosen by these
-    assert tau / 2 < split.ahead <= 2 * tau
-    assert all(len(e) >= split.ahead for e in split.held_out)
-    assert len(split.held_out) >= 12  # so that a band is finite
-    assert f"judged {split.ahead} steps = {0.01 * split.ahead:.3g} s ahead" in " ".join(split.notes)
-    asked = read_logs(tmp_path / "slow.csv", 30, rng, 10**9, {})
-    assert (asked.horizon, asked.ahead) == (30, 30)
-    np.savetxt(tmp_path / "short.csv", rows[:900], delimiter=",", header="time [s],u,y", comments="")
-    short = read_logs(tmp_path / "short.csv", None, rng, 10**9, {})  # too short for a band at any horizon
-    assert 20 < short.ahead <= 45 - 12
-    assert len(short.held_out) >= 4
-    assert "the outputs remember" in " ".join(short.notes)
-
-
-def test_the_verdict_on_several_records_looks_no_further_ahead_than_a_block_of_one_of_them(tmp_path):
-    rng = np.random.default_rng(0)
-    for i in range(5):
-        u = rng.standard_normal(300)
-        y = signal.lfilter([0, 1], [1, -np.exp(-1 / 100)], u)
-        rows = np.column_stack([0.01 * np.arange(300), u, y])
-        np.savetxt(tmp_path / f"{i}.csv", rows, delimiter=",", header="time [s],u,y", comments="")
-    split = read_logs(tmp_path, None, rng, 10**9, {})
-    assert len(split.held_out) == 5  # a block of a fifth of all would cross the ends of records
-    assert 20 < split.ahead < 60
-    assert all(len(e) > split.ahead for e in split.held_out)
+    _, said = fit(tmp_path, tmp_path / "csv" / "00.csv", "--horizon", "10", "--linear")
+    assert re.search(r"the last fifth of the record is held out, in \d+ blocks", said)
 
 
 @pytest.mark.usefixtures("quick")
@@ -243,38 +191,23 @@ def test_columns_that_say_nothing_are_left_out_and_wrapped_angles_unwrapped_and_
         names = ["x", "v", "omega", "theta", "temp", "again"]
         U = np.column_stack([e.U, np.zeros(len(e))])
         km.Episodes([km.Episode(X=X, U=U)], 0.02, names, ["force", "brake"]).save(tmp_path / "in" / f"{i:02d}.npz")
-    told = []
-    found = fit_data(
-        tmp_path / "in", tmp_path / "out", FitOptions(horizon=10, linear=True), memory=memory, say=told.append
-    )
-    for words in (
-        "left out: temp is 7 throughout",
-        "left out: again repeats x",
-        "left out: brake is 0 through",
-    ):
-        assert f"! {words}" in told[0]
-    assert re.search(r"! theta jumped by 2π \d+ times and was unwrapped", told[0])
-    model = found.selection.predictor
+    monkeypatch.setattr("koopmpc.apps.fitting.logs.IN_MEMORY", memory)
+    folder, said = fit(tmp_path, tmp_path / "in", "--horizon", "10", "--linear")
+    for words in ("left out: temp is 7 throughout", "left out: again repeats x", "left out: brake is 0 through"):
+        assert f"! {words}" in said
+    assert re.search(r"! theta jumped by 2π \d+ times and was unwrapped", said)
+    model = km.load_model(folder / "model.npz")
     assert (model.states, model.inputs) == (("x", "v", "omega", "theta"), ("force",))
-    steps = np.concatenate([np.diff(e.X[:, 3]) for e in found.held_out])
-    assert np.abs(steps).max() < 1.0
-
-
-def test_data_in_which_nothing_moves_are_refused():
-    still = km.Episodes([km.Episode(X=np.ones((9, 2)), U=np.zeros((8, 0)))], 0.1)
-    with pytest.raises(km.errors.DataError, match="no state moves"):
-        find_repairs(still)
 
 
 @pytest.mark.usefixtures("quick")
 def test_a_folder_of_runs_is_data_though_their_table_is_in_it(tmp_path):
     problem = km.load_problem(write(tmp_path))
     km.sweep([problem], ["lqr"], folder=tmp_path / "runs")
-    assert (tmp_path / "runs" / RESULTS).exists()
-    told = []
-    found = fit_data(tmp_path / "runs", tmp_path / "out", FitOptions(horizon=1), say=told.append)
-    assert "2 files" in told[0]
-    assert found.selection.predictor.states == problem.dynamics.states
+    assert (tmp_path / "runs" / "results.parquet").exists()
+    folder, said = fit(tmp_path, tmp_path / "runs", "--horizon", "1")
+    assert "2 files" in said
+    assert km.load_model(folder / "model.npz").states == problem.dynamics.states
 
 
 @pytest.mark.usefixtures("quick")
@@ -282,9 +215,8 @@ def test_gaps_are_told(tmp_path):
     folder = write_csv(cart_pole(16), tmp_path / "csv")
     lines = (folder / "03.csv").read_text().splitlines()
     (folder / "03.csv").write_text("\n".join(lines[:20] + lines[25:]) + "\n")
-    told = []
-    fit_data(folder, tmp_path / "out", FitOptions(horizon=10), say=told.append)
-    assert re.search(r"! .*03\.csv.*gap", told[0])
+    _, said = fit(tmp_path, folder, "--horizon", "10")
+    assert re.search(r"! .*03\.csv.*gap", said)
 
 
 @pytest.mark.usefixtures("few")
@@ -292,12 +224,11 @@ def test_a_picture_or_a_log_that_fails_costs_neither_model_nor_report(tmp_path, 
     def fails(*_, **__):
         raise RuntimeError("no ink")
 
-    monkeypatch.setattr(koopmpc.apps.fitting.fit, "record_model", fails)
-    monkeypatch.setattr(koopmpc.apps.fitting.fit, "_ROLLOUTS", 0)
-    monkeypatch.setattr(koopmpc.apps.fitting.fit, "spectrum", fails)
+    monkeypatch.setattr("koopmpc.apps.fitting.fit.record_model", fails)
+    monkeypatch.setattr("koopmpc.apps.fitting.fit.spectrum", fails)
     write_csv(cart_pole(16), tmp_path / "csv")
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, ["fit", "csv", "--horizon", "10", "--linear"])
+    result = koopmpc("fit", "csv", "--horizon", "10", "--linear")
     assert result.exit_code == 0, result.output
     (folder,) = (tmp_path / "logs").iterdir()
     assert km.load_model(folder / "model.npz").nu == 1
@@ -340,7 +271,7 @@ def test_a_mistake_gives_one_message_and_exit_code_2(tmp_path, monkeypatch, argu
     rows = np.random.default_rng(0).normal(size=(400, 3))
     np.savetxt(tmp_path / "bare.dat", rows)
     np.savetxt(tmp_path / "told.csv", np.c_[0.1 * np.arange(400), rows], delimiter=",", header="t,a,b,c", comments="")
-    result = CliRunner().invoke(app, ["fit", *arguments])
+    result = koopmpc("fit", *arguments)
     assert result.exit_code == 2, result.output
     assert words in result.stderr
     assert "Traceback" not in result.output
@@ -348,31 +279,16 @@ def test_a_mistake_gives_one_message_and_exit_code_2(tmp_path, monkeypatch, argu
     assert not list(tmp_path.glob("logs/*"))  # no empty folder is left behind
 
 
-def test_roles_that_names_alone_tell_are_said_to_be_guessed(tmp_path):
-    folder = write_csv(cart_pole(1, steps=5), tmp_path / "csv", header="time [s],x,theta,v,omega,inflow")
-    cart_pole(1, steps=5).save(tmp_path / "own.csv")
-    (sentence,) = describe_guesses([folder / "00.csv"], {})
-    assert "guessed from their names; --inputs u,v and --states a,b say it" in sentence
-    assert describe_guesses([folder / "00.csv"], {"inputs": ["inflow"]}) == []
-    assert describe_guesses([tmp_path / "own.csv"], {}) == describe_guesses([tmp_path / "own.npz"], {}) == []
-
-
 def test_states_and_inputs_may_be_told(tmp_path, monkeypatch, quick):
     monkeypatch.chdir(tmp_path)
     write_csv(cart_pole(16), tmp_path / "csv", header="when,p,q,r,s,push")
     arguments = ["--states", "p, q,r,s", "--inputs", "push", "--dt", "0.02", "--linear", "--name", "cart"]
-    result = CliRunner().invoke(app, ["fit", "csv", *arguments])
+    result = koopmpc("fit", "csv", *arguments)
     assert result.exit_code == 0, result.output
     (folder,) = (tmp_path / "logs").iterdir()
     assert folder.name.endswith("-cart")
     model = km.load_model(folder / "model.npz")
     assert (model.states, model.inputs, model.dt) == (("p", "q", "r", "s"), ("push",), 0.02)
-
-
-def test_too_little_data_is_told(tmp_path):
-    cart_pole(2, steps=20).save(tmp_path / "data.npz")
-    with pytest.raises(km.errors.DataError, match="too few of 22 steps"):
-        divide_files(km.data.Files(tmp_path / "data.npz"), 20, np.random.default_rng(0), 10**9)
 
 
 @pytest.mark.usefixtures("quick")
@@ -384,20 +300,12 @@ def test_what_files_have_in_common_is_said_once_and_no_column_of_one_file_is_jud
             cells = [0.02 * k, *row, float(i), push]
             lines.append(",".join("" if np.isnan(c) else repr(float(c)) for c in cells))
         (tmp_path / f"{i:02d}.csv").write_text("\n".join(lines))
-    told = []
-    found = fit_data(tmp_path, tmp_path / "out", FitOptions(horizon=10, linear=True), say=told.append)
-    (gaps,) = [line for line in told[0].splitlines() if " gap" in line]
+    folder, said = fit(tmp_path, tmp_path, "--horizon", "10", "--linear")
+    (gaps,) = [line for line in said.splitlines() if " gap" in line]
     every_other = ", ".join(f"{i:02d}.csv" for i in range(2, 24, 2))
     assert gaps.startswith(f"! 12 files ({tmp_path / '00.csv'}, {every_other}): 1 gap (after line 11)")
-    assert "throughout" not in told[0]  # load is constant in each file, and not over all of them
-    assert "load" in found.selection.predictor.states
-
-
-def test_of_notes_that_differ_from_file_to_file_the_first_are_shown_and_the_others_counted(tmp_path):
-    files = [tmp_path / f"{i}.csv" for i in range(9)]
-    short = shorten_notes([*(f"{file}: gap {i}" for i, file in enumerate(files)), "of all: one"], files)
-    assert short[:2] == [f"{files[0]}: gap 0", f"{files[1]}: gap 1"]
-    assert short[6:] == ["of all: one", "3 more files have notes of their own; load_episodes shows them"]
+    assert "throughout" not in said  # load is constant in each file, and not over all of them
+    assert "load" in km.load_model(folder / "model.npz").states
 
 
 @pytest.mark.usefixtures("quick")
@@ -410,14 +318,10 @@ def test_logs_are_audited_and_what_is_safe_is_done_and_said(tmp_path):
         made.append(km.Episode(X=X, U=U))
     (tmp_path / "in").mkdir()
     data.with_episodes(made).save(tmp_path / "in" / "late.npz")
-    told = []
-    found = fit_data(tmp_path / "in", tmp_path / "out", FitOptions(horizon=10, linear=True), say=told.append)
-    assert re.search(
-        r"! spikes: theta leaves its path and returns, 20 times: .*these rows were left out", told[0], re.S
-    )
-    assert re.search(r"! input delay: force acts 3 steps late; models that see 3 steps of the past are", told[0])
-    assert max(np.abs(e.X[:, 1]).max() for e in found.held_out) < 20
-    assert divide_files(km.data.Files(tmp_path / "in"), 10, np.random.default_rng(0), 10**9).delay == 3
+    _, said = fit(tmp_path, tmp_path / "in", "--horizon", "10", "--linear")
+    assert re.search(r"! spikes: theta leaves its path and returns, 20 times: .*these rows were left out", said, re.S)
+    assert re.search(r"! input delay: force acts 3 steps late; models that see 3 steps of the past are", said)
+    assert float(re.search(r"theta +\S+ … (\S+)", said)[1]) < 20
 
 
 @pytest.mark.usefixtures("quick")
@@ -430,20 +334,8 @@ def test_a_clock_that_jitters_is_evened_and_that_is_said(tmp_path):
         np.savetxt(
             tmp_path / "csv" / f"{i:02d}.csv", rows, delimiter=",", header="time [s],x,theta,v,omega,force", comments=""
         )
-    told = []
-    fit_data(tmp_path / "csv", tmp_path / "out", FitOptions(horizon=10, linear=True), say=told.append)
+    _, said = fit(tmp_path, tmp_path / "csv", "--horizon", "10", "--linear")
     unequal = r"sampling is unequal in 16 files, interpolated to 0\.0\d+ s; steps that differ by more than 2 %: "
-    assert re.search(unequal + r"\S*00\.csv \(\d+ of 40, from line \d+\), 01\.csv \(", " ".join(told[0].split()))
+    assert re.search(unequal + r"\S*00\.csv \(\d+ of 40, from line \d+\), 01\.csv \(", " ".join(said.split()))
     with pytest.raises(km.errors.DataError, match="sampling is unequal"):
         km.load_episodes(tmp_path / "csv" / "00.csv")
-
-
-def test_a_clock_that_is_set_back_is_told_and_one_that_starts_anew_is_not(tmp_path):
-    def table(times):
-        rows = np.column_stack([times, np.random.default_rng(0).normal(size=(len(times), 2))])
-        np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header="time [s],x,u", comments="")
-        return km.load_episodes(tmp_path / "a.csv")
-
-    assert len(table(np.tile(np.arange(10) * 0.1, 3))) == 3
-    with pytest.warns(km.FitWarning, match="the clock is set back 1 times, before row 11; an episode ends there"):
-        assert len(table(np.concatenate([np.arange(10), np.arange(5, 15)]) * 0.1)) == 2

@@ -89,29 +89,6 @@ def test_a_cut_log_is_repaired_as_far_as_it_is_whole(tmp_path):
     np.testing.assert_array_equal(km.load_run(cut.repaired).X, run.X[: cut.values["steps"] + 1])
 
 
-@pytest.mark.slow
-def test_a_log_that_was_cut_is_read_and_repaired_and_one_that_is_none_is_refused(tmp_path):
-    run = record_pendulum(tmp_path / "whole.rrd", 600)
-    data = (tmp_path / "whole.rrd").read_bytes()
-    (tmp_path / "cut.rrd").write_bytes(data[: int(0.4 * len(data))])
-    (tmp_path / "none.rrd").write_bytes(b"RRF2" + bytes(100))
-    found = {each.path.name: each for each in km.bench.inspect_logs([tmp_path], repair=True)}
-    assert found["whole.rrd"].cut is None
-    assert found["none.rrd"].refused is not None
-    cut = found["cut.rrd"]
-    assert cut.cut is not None
-    assert 0 < cut.values["steps"] < 600
-    repaired = km.load_run(cut.repaired)
-    np.testing.assert_array_equal(repaired.X, run.X[: repaired.steps + 1])
-    (again,) = km.bench.inspect_logs([cut.repaired])
-    assert again.cut is None
-    assert again.metrics == cut.metrics
-    with pytest.raises(km.errors.LogError, match="there is no log in"):
-        list(km.bench.inspect_logs([tmp_path / "missing" / ".."])) if (tmp_path / "missing").mkdir() else list(
-            km.bench.inspect_logs([tmp_path / "missing"])
-        )
-
-
 def test_every_run_of_a_sweep_replays_to_the_bit(swept):
     for row in swept[0]:
         found = km.bench.replay_log(row.log)

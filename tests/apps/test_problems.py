@@ -1,6 +1,8 @@
 """The library of problems: each file is self-contained, and each of its controllers runs within hard limits."""
 
 import ast
+import json
+import re
 import sys
 import warnings
 from dataclasses import replace
@@ -11,19 +13,27 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.apps.bench.controllers import CONTROLLERS, Prepared, controller_names
-from koopmpc.apps.bench.measured import BASELINE, describe_best, find_best_learned, read_standings
-from koopmpc.apps.bench.single import run_closed_loop
-from koopmpc.apps.bench.store import ORACLE, RunRow
-from koopmpc.loop.metrics import Metrics
-from koopmpc.views.figures.reports import draw_trajectories
 from tests import tiers
+from tests.commands import koopmpc
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs" / "tools"))
-from standings import compute_standings, find_frugal, format_goals, format_standings
+from standings import (
+    PATH,
+    Standing,
+    compute_standings,
+    find_best_learned,
+    find_frugal,
+    format_goals,
+    format_standings,
+)
 
+STANDINGS = {
+    problem: {name: Standing(*values) for name, values in each.items()}
+    for problem, each in json.loads(PATH.read_text("utf-8")).items()
+}
 FILES = {path.stem: path for path in km.bench.shipped()}
 SMALL = ("bilinear_motor", "cart_pole", "duffing", "heat_pump", "pendulum", "pendulum_swing", "van_der_pol")
+USUAL = tuple(name for name, entry in km.bench.CONTROLLERS.items() if not entry.on_request)
 MOST_LINES = 120
 STEPS = 4
 
@@ -34,20 +44,22 @@ def path(request: pytest.FixtureRequest) -> Path:
 
 
 @cache
-def few(path: Path) -> Prepared:
+def few(path: Path) -> km.bench.Prepared:
     """Return the parts of the problem in this file, with little data to learn from."""
     problem = km.load_problem(path)
     training = problem.training
     x0 = training.x0 if isinstance(training.x0, km.Uniform) else np.asarray(training.x0)[:40]
-    return Prepared(replace(problem, training=replace(training, x0=x0, episodes=40, steps=min(training.steps, 25))))
+    return km.bench.Prepared(
+        replace(problem, training=replace(training, x0=x0, episodes=40, steps=min(training.steps, 25)))
+    )
 
 
 def test_the_library_holds_what_its_page_lists():
-    assert set(read_standings()) <= set(FILES)
+    assert set(STANDINGS) <= set(FILES)
     named = Path(__file__).parents[2].joinpath("docs", "library.md").read_text("utf-8")
     assert [name for name in FILES if f"`{name}`" not in named] == []
-    assert format_standings(read_standings()) in named
-    assert format_goals(read_standings()) in named
+    assert format_standings(STANDINGS) in named
+    assert format_goals(STANDINGS) in named
     pages = Path(__file__).parents[2] / "docs" / "problems"
     for name, path in FILES.items():
         text = (pages / f"{name}.md").read_text("utf-8")
@@ -60,7 +72,7 @@ def test_the_library_holds_what_its_page_lists():
 
 
 def test_on_a_dozen_problems_a_learned_controller_is_as_good_as_nonlinear_mpc_and_much_faster():
-    assert sum(find_frugal(found) is not None for found in read_standings().values() if ORACLE in found) >= 12
+    assert sum(find_frugal(found) is not None for found in STANDINGS.values() if "nonlinear-mpc" in found) >= 12
 
 
 def test_a_problem_is_one_short_file_that_imports_numpy_casadi_and_koopmpc_alone(path: Path):
@@ -89,13 +101,13 @@ def test_each_controller_runs_on_each_problem_and_keeps_its_hard_limits(path: Pa
         limits = problem.limits_of(name)
         low, high = limits.inputs(problem.dynamics.nu)
         reference, W = np.asarray(case.reference), problem.measured_of(name)
-        all_of_them = ("lqr", "linear-mpc") if large else controller_names(problem.controllers)
+        all_of_them = ("lqr", "linear-mpc") if large else (problem.controllers or USUAL)
         if not every and not large:
             all_of_them = [each for i, each in enumerate(all_of_them) if (i + sorted(FILES).index(path.stem)) % 3 == 0]
         for controller in all_of_them if name == first else ("lqr",) if large else ("koopman-mpc",):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", km.FitWarning)  # of models that were fitted to less than they need
-                built = CONTROLLERS[controller].build(parts, limits)
+                built = km.bench.CONTROLLERS[controller].build(parts, limits)
             run = km.simulate(
                 parts.truth_of(name),
                 built,
@@ -149,7 +161,9 @@ def test_a_case_has_noise_and_broken_parts_of_its_own(tmp_path: Path):
     plain, run = (km.load_run(tmp_path / f"pendulum-{name}-lqr.rrd") for name in ("plain", "broken"))
     np.testing.assert_array_equal(plain.Y, plain.X)
     assert (run.Y != run.X).all()
-    np.testing.assert_allclose(run.X[1], Prepared(problem).step_map(run.X[0], [0.0]))  # nothing has come through yet
+    np.testing.assert_allclose(
+        run.X[1], km.bench.Prepared(problem).step_map(run.X[0], [0.0])
+    )  # nothing has come through yet
 
 
 def test_a_problem_with_measured_disturbances_is_learned_told_recorded_and_replayed(tmp_path: Path):
@@ -157,18 +171,15 @@ def test_a_problem_with_measured_disturbances_is_learned_told_recorded_and_repla
     case = problem.cases["front"]
     forecast = replace(case, steps=20, measured=np.repeat([[2.0], [-8.0]], 10, axis=0))
     cases = {"front": forecast, "still": replace(case, steps=20, measured=[2.0])}
-    parts = Prepared(replace(problem, training=replace(problem.training, episodes=8), cases=cases))
+    parts = km.bench.Prepared(replace(problem, training=replace(problem.training, episodes=8), cases=cases))
     assert parts.model.nw == parts.bilinear.nw == parts.local_model.nw == 1
     assert parts.bilinear.is_scheduled
-    runs = {}
-    for name in cases:
-        row = RunRow("heat_pump", name, "linear-mpc", x0=tuple(case.x0))
-        runs[name] = run_closed_loop(parts, row, plans=False)
+    rows = km.sweep([parts.problem], ["linear-mpc"], folder=tmp_path)
+    runs = {row.case: km.load_run(row.log) for row in rows}
     assert np.array_equal(runs["front"].metadata["measured"], forecast.measured)
     assert runs["front"].U[8] > runs["still"].U[8] + 0.01  # the cold is known before it comes
-    km.record(runs["front"], tmp_path / "run.rrd")
     mpc = parts.controller("linear-mpc", "front")
-    again = km.bench.replay_log(tmp_path / "run.rrd", plant=parts.step_map, controller=mpc)
+    again = km.bench.replay_log(rows[0].log, plant=parts.step_map, controller=mpc)
     assert again.differences == ()
 
 
@@ -178,10 +189,10 @@ def test_a_design_that_was_written_before_is_read_for_its_limits_and_no_other(tm
     limits = problem.limits_of(case)
     local = km.LinearPredictor.local(km.discretize(problem.dynamics, problem.dt), *problem.equilibrium)
     km.LQR(local, problem.cost).save(tmp_path / f"pendulum-0-{case}.npz")
-    kept = Prepared(problem, kept=tmp_path).load_design(limits)
+    kept = km.bench.Prepared(problem, kept=tmp_path).load_design(limits)
     assert isinstance(kept, km.LQR)
-    assert Prepared(problem, seed=1, kept=tmp_path).load_design(limits) is None
-    assert Prepared(problem, kept=tmp_path).load_design(km.Limits(u_max=1e-3)) is None
+    assert km.bench.Prepared(problem, seed=1, kept=tmp_path).load_design(limits) is None
+    assert km.bench.Prepared(problem, kept=tmp_path).load_design(km.Limits(u_max=1e-3)) is None
 
 
 def test_inputs_that_hold_a_reference_are_those_under_the_weather_of_each_step():
@@ -189,7 +200,7 @@ def test_inputs_that_hold_a_reference_are_those_under_the_weather_of_each_step()
     problem = replace(problem, cost=replace(problem.cost, u_target="equilibrium"))
     weather = np.repeat([[-5.0], [10.0]], 3, axis=0)
     case = replace(problem.cases["cold"], steps=6, measured=weather)
-    parts = Prepared(replace(problem, cases={"cold": case}))
+    parts = km.bench.Prepared(replace(problem, cases={"cold": case}))
     held = parts.u_reference("cold")
     for u, w in zip(held, weather, strict=True):
         x = [21.0, 21.0 + 0.25 * (21.0 - w[0])]  # the floor warms the room as much as the walls lose
@@ -197,11 +208,11 @@ def test_inputs_that_hold_a_reference_are_those_under_the_weather_of_each_step()
     assert held[0, 0] > 2 * held[-1, 0]
 
 
-def _row(problem: km.Problem, case: str, controller: str, cost: float, share: float = 0.0) -> RunRow:
+def _row(problem: km.Problem, case: str, controller: str, cost: float, share: float = 0.0) -> km.bench.RunRow:
     figures = dict.fromkeys(("tracking_rmse", "final_error"), np.zeros(2))
     numbers = dict.fromkeys(("input_violation", "effort", "settling_time", "solve_time_p99", "solve_time_max"), 0.0)
     time = 1e-3 if controller == "nonlinear-mpc" else 1e-5
-    measured = Metrics(
+    measured = km.loop.Metrics(
         **figures,
         **numbers,
         cost=cost,
@@ -212,7 +223,7 @@ def _row(problem: km.Problem, case: str, controller: str, cost: float, share: fl
         status={},
         fallback={},
     )
-    return RunRow(problem.name, case, controller, measured)
+    return km.bench.RunRow(problem.name, case, controller, measured)
 
 
 def test_a_standing_is_the_worst_ratio_over_the_cases_in_which_the_model_is_the_plant():
@@ -224,7 +235,7 @@ def test_a_standing_is_the_worst_ratio_over_the_cases_in_which_the_model_is_the_
         for case in problem.cases
     ]
     rows += [_row(problem, case, "lqr", 1.0, share=0.3) for case in problem.cases]
-    rows += [RunRow(problem.name, case, "bilinear-mpc") for case in problem.cases]
+    rows += [km.bench.RunRow(problem.name, case, "bilinear-mpc") for case in problem.cases]
     found = compute_standings(rows, [problem])["van_der_pol"]
     koopman = found["koopman-mpc"]
     assert (koopman.ratio, koopman.over, koopman.time) == (pytest.approx(1.2), False, pytest.approx(0.01))
@@ -233,19 +244,23 @@ def test_a_standing_is_the_worst_ratio_over_the_cases_in_which_the_model_is_the_
     assert "| `van_der_pol` | **1.2** | 0.5† | lost |" in format_standings({"van_der_pol": found})
 
 
-def test_each_problem_of_the_list_has_its_number():
-    for name, found in read_standings().items():
-        assert find_best_learned(
-            found
-        ) is None or f"× the cost of {'nonlinear-mpc' if 'nonlinear-mpc' in found else BASELINE}" in describe_best(name)
-    assert describe_best("no such problem") == ""
+def test_each_problem_of_the_list_has_its_number(tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    listed, name = {}, ""
+    for line in koopmpc("list").stdout.splitlines():
+        name = line.split("  ")[0] if line.split("  ")[0] in FILES else name
+        if (told := re.search(r"× the cost of (\S+),", line)) is not None:
+            listed[name] = told[1]
+    for name, found in STANDINGS.items():
+        if find_best_learned(found) is not None:
+            assert listed[name] == ("nonlinear-mpc" if "nonlinear-mpc" in found else "linear-mpc")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(read_standings()))
+@pytest.mark.parametrize("name", sorted(STANDINGS))
 def test_what_is_said_of_the_best_learned_controller_is_what_a_run_gives(name: str, tmp_path: Path):
-    problem, said = km.load_problem(FILES[name]), read_standings()[name]
-    best, baseline = find_best_learned(said), "nonlinear-mpc" if "nonlinear-mpc" in said else BASELINE
+    problem, said = km.load_problem(FILES[name]), STANDINGS[name]
+    best, baseline = find_best_learned(said), "nonlinear-mpc" if "nonlinear-mpc" in said else "linear-mpc"
     assert best is not None
     rows = km.sweep([replace(problem, scene=lambda x, u: [])], [best, baseline], folder=tmp_path)
     assert [row.failure for row in rows if row.failure] == []
@@ -254,10 +269,9 @@ def test_what_is_said_of_the_best_learned_controller_is_what_a_run_gives(name: s
 
 @pytest.mark.parametrize(("name", "label"), [("cstr", "time [h]"), ("pendulum", "time [s]")])
 def test_pictures_of_runs_label_time_in_the_unit_of_their_problem(name, label, tmp_path):
-    prepared = few(FILES[name])
-    case, one = next(iter(prepared.problem.cases.items()))
-    run = run_closed_loop(prepared, RunRow(name, case, "lqr", x0=tuple(one.x0)), plans=False).take_first(STEPS)
-    km.record(run, tmp_path / "run.rrd")
-    for each in (run, km.load_run(tmp_path / "run.rrd")):
-        pictures = km.plot.run(each), km.plot.runs({case: {"lqr": each}}), draw_trajectories({"lqr": each})
-        assert [picture.axes[-1].get_xlabel() for picture in pictures] == [label] * 3
+    problem = few(FILES[name]).problem
+    case, one = next(iter(problem.cases.items()))
+    (row,) = km.sweep([replace(problem, cases={case: replace(one, steps=STEPS)})], ["lqr"], folder=tmp_path)
+    run = km.load_run(row.log)
+    pictures = km.plot.run(run), km.plot.runs({case: {"lqr": run}})
+    assert [picture.axes[-1].get_xlabel() for picture in pictures] == [label] * 2

@@ -9,7 +9,7 @@ from scipy.integrate import quad
 
 import koopmpc as km
 
-Page, Verdict, add_verdicts = km.papers.Page, km.papers.Verdict, km.papers.add_verdicts
+Verdict = km.papers.Verdict
 report, theory, plants, control, setup = (
     km.papers.import_paper_module(name)
     for name in ("snyder.figures", "snyder.theory", "plants", "snyder.control", "snyder.settings")
@@ -215,57 +215,3 @@ def test_the_lessons_of_the_page_are_those_of_its_costs():
     assert ratio["LQR, Fourier 1"][1] == float(lifted) < float(local) == ratio["LQR, linearisation"][1]
     assert upright.min() == 1.0
     assert shift.max() < 1.001
-
-
-def told(fits, *, ours, feedback, excited):
-    """Return the verdicts of abstract and discussion for made-up costs and predictions."""
-    names = ("DMD, feedback data", "DMDc, feedback data", "EDMDc, exciting data")
-    predicted = {"pendulum": {name: control.Prediction(name, feedback, excited, 1.0, "–") for name in names}}
-    ratios = {"a task": {"LQR, linearisation": 1.05, "LQR, Fourier 1": ours, control.ORACLE: 1.0}}
-    return {claim.says: claim.verdict for claim in report.judge_text(fits, 3e-5, predicted, ratios)}
-
-
-def test_verdicts_of_the_text_follow_the_numbers(fits):
-    linear, data = "linear control acts on the nonlinear system", "data under LQR show a controlled system"
-
-    def verdict(says, **numbers):
-        found = told(fits, **({"ours": 1.0, "feedback": 0.0, "excited": 0.0} | numbers))
-        return next(value for claim, value in found.items() if claim.startswith(says))
-
-    assert verdict(linear, ours=1.02) is Verdict.HOLDS
-    assert verdict(linear, ours=1.08) is Verdict.IN_PART
-    assert verdict(linear, ours=1.3) is Verdict.FAILS
-    assert verdict(data, excited=0.01) is Verdict.HOLDS
-    assert verdict(data, excited=0.5) is Verdict.IN_PART
-    assert verdict(data, excited=0.5, feedback=0.5) is Verdict.FAILS
-    assert verdict("the pendulum is inverted") is Verdict.FAILS
-    assert verdict("truncation has to be avoided") is Verdict.HOLDS
-    assert verdict("the cart-pole is beyond") is Verdict.IN_PART
-    assert verdict("EDMD finds the leading Koopman eigenfunctions") is Verdict.IN_PART
-
-
-def test_reasons_of_the_text_end_with_what_they_say_and_point_to_no_other_table(fits):
-    names = ("DMD, feedback data", "DMDc, feedback data", "EDMDc, exciting data")
-    predicted = {"pendulum": {name: control.Prediction(name, 0.0, 0.0, 1.0, "–") for name in names}}
-    ratios = {"a task": {"LQR, linearisation": 1.05, "LQR, Fourier 1": 1.0, control.ORACLE: 1.0}}
-    reasons = {claim.says: claim.why for claim in report.judge_text(fits, 3e-5, predicted, ratios)}
-    assert reasons["control on the lifted model is future work"].endswith("times the cost of nonlinear MPC at most")
-    assert not [why for why in reasons.values() if "below" in why or why.endswith(":")]
-
-
-def test_the_parts_of_the_report_hold_their_tables_and_pictures(settings, fits, tmp_path):
-    page = Page(tmp_path, beside="snyder")
-    claims = report.judge_figures(fits)
-    report.add_opening(page, claims, 0.01, 10)
-    add_verdicts(page, claims)
-    report.tabulate_figures(page, settings, fits, claims)
-    report.add_feedbacks(page)
-    theory.add_frequencies(page, fits)
-    theory.add_equations(page, settings["pendulum"], fits)
-    report.appendix_dmdc(page, settings["pendulum"], settings["pendulum-lqr"])
-    gains_of_page = PAGE.read_text(encoding="utf-8").split("## The feedbacks")[1].split("\n## ")[0]
-    assert gains_of_page.strip() in page.markdown
-    assert {path.stem for path in tmp_path.rglob("*.png")} == {"pendulum-eigenfunctions", "appendix-pendulum-dmdc"}
-    assert [curves.columns[-1] for curves in page.curves] == ["log10 of the relative error"] * 2
-    assert "| DMDc, LQR data | 2 of 3 |" in page.markdown
-    assert page.markdown.count("\n| pendulum-") == 18 + 10  # lines of the figures, and claims

@@ -78,26 +78,21 @@ def test_workers_give_what_one_process_gives_and_learn_once(problem, whole, tmp_
     assert len({row.training_time for row in rows if row.controller == "koopman-mpc" and row.seed == 0}) == 1
 
 
-def test_what_is_finished_is_not_run_again(problem, whole, tmp_path, monkeypatch):
+def test_what_is_finished_is_not_run_again(problem, whole, tmp_path):
     ran = []
 
-    def counted(parts, row, folder, **more):
-        if len(ran) == 20:
+    def stop(what, done, total):
+        ran.append(what)
+        if done == 20:
             raise KeyboardInterrupt
-        ran.append(row.key)
-        return original(parts, row, folder, **more)
 
-    from koopmpc.apps.bench import sweep as room
-
-    original = room.measure_run
-    monkeypatch.setattr("koopmpc.apps.bench.sweep.measure_run", counted)
     with pytest.raises(KeyboardInterrupt):
-        km.sweep([problem], TWO, folder=tmp_path, options=km.bench.SweepOptions(**GRID))
-    assert pq.read_table(tmp_path / "results.parquet").num_rows <= 20 == len(km.bench.load_rows(tmp_path))
-    ran.append(None)
-    rows = km.sweep([problem], TWO, folder=tmp_path, options=km.bench.SweepOptions(**GRID))
+        km.sweep([problem], TWO, folder=tmp_path, options=km.bench.SweepOptions(**GRID), progress=stop)
+    assert pq.read_table(tmp_path / "results.parquet").num_rows == 20 == len(km.bench.load_rows(tmp_path))
+    options = km.bench.SweepOptions(**GRID)
+    rows = km.sweep([problem], TWO, folder=tmp_path, options=options, progress=lambda what, *_: ran.append(what))
     assert figures(rows) == figures(whole[0])
-    assert len(ran) - 1 == len(set(ran) - {None}) == len(rows)
+    assert len(ran) == 1 + 20 + 1 + len(rows) - 20  # each begins by naming what comes first, and none ran twice
 
 
 def test_a_damaged_row_is_told_and_run_again_and_nothing_else(problem, whole, tmp_path):
@@ -210,6 +205,21 @@ def test_a_report_is_one_file_with_every_case_and_controller(whole):
     costs = [row.metrics.cost for row in whole[0] if row.key[:5] == ("tiny", "near", "lqr", None, 0.0)]
     (line,) = (line for line in lines if line.startswith("tiny:near,–,lqr"))
     assert float(line.split(",")[6]) == np.median(costs)
+
+
+def test_a_profile_divides_each_cost_by_the_least_of_those_that_reached_from_the_same_start(whole, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("koopmpc.apps.bench.report.draw_profiles", drawn.append)
+    monkeypatch.setattr("koopmpc.apps.bench.report.render_svg", lambda _: "<svg></svg>")
+    km.bench.write_report(whole[1])
+    rows = [row for row in whole[0] if row.case == "near"]
+    for name in TWO:
+        ratios = []
+        for row in (row for row in rows if row.controller == name):
+            same = [other for other in rows if (other.noise, other.start) == (row.noise, row.start) and other.reached]
+            least = min((other.metrics.cost for other in same), default=np.nan)
+            ratios.append(row.metrics.cost / least if row.reached else np.inf)
+        assert drawn[0][name].tolist() == ratios
 
 
 def test_a_sweep_is_no_regression_of_itself_and_a_worse_one_is(problem, whole, tmp_path):

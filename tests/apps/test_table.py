@@ -8,7 +8,6 @@ import pytest
 from rich.console import Console
 
 import koopmpc as km
-from koopmpc.apps.bench.report import _profile
 
 GOOD = km.loop.Metrics(
     cost=120.5,
@@ -166,26 +165,3 @@ def test_the_eight_controllers_under_every_fault_fit_a_hundred_columns():
     assert "…" not in text
     assert max(len(line) for line in text.split("\n")) <= 100
     assert text.count("8e+06 (300)") == len(km.bench.FAULTS) * len(km.bench.CONTROLLERS)
-
-
-def test_a_profile_divides_each_cost_by_the_least_of_those_that_reached_from_the_same_start(monkeypatch):
-    costs = {
-        "a": [1.0, 8.0, 3.0],
-        "b": [2.0, 2.0, np.inf],
-        "c": [4.0, 1.0, np.inf],
-    }  # but c does not reach from start 1
-    ran = [
-        km.bench.RunRow("plant", "case", name, replace(GOOD, cost=cost), start=k, reached=(name, k) != ("c", 1))
-        for name, values in costs.items()
-        for k, cost in enumerate(values)
-        if np.isfinite(cost)
-    ]
-    drawn = []
-    monkeypatch.setattr("koopmpc.apps.bench.report.draw_profiles", drawn.append)
-    monkeypatch.setattr("koopmpc.apps.bench.report.render_svg", lambda _: "")
-    list(_profile(ran))
-    assert {name: values.tolist() for name, values in drawn[0].items()} == {
-        "a": [1.0, 4.0, 1.0],
-        "b": [2.0, 1.0],
-        "c": [4.0, np.inf],
-    }

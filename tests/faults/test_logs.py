@@ -8,13 +8,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 import koopmpc as km
-from koopmpc.views.recording.description import Entity
-from koopmpc.views.recording.reader import LogColumns
-from koopmpc.views.recording.rrd import Column, Contents
 from tests.tiers import slow
 from tests.views.runs import about, make_run, steps_of
 
@@ -255,57 +251,3 @@ def test_a_log_whose_rows_differ_in_length_is_refused_by_its_name(tmp_path: Path
     longer.disconnect()
     with pytest.raises(km.errors.LogError, match=r"run\.rrd is damaged: reference has rows of different lengths"):
         km.load_run(path)
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_rows_come_in_order_of_their_steps_whatever_that_of_their_batches(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    count, values, missing = 12, rng.normal(size=(12, 2)), 3 + seed if seed % 2 else 12
-    order = rng.permutation([k for k in range(count) if k != missing])
-    told = rng.random(count) < 0.6  # of a column that has no number in some rows
-    columns = []
-    for part in np.array_split(order, 4):
-        for entity, rows in (("/a", values), ("/s", [[each[0]] if told[k] else [] for k, each in enumerate(values)])):
-            lists = pa.array([list(rows[k]) for k in part], pa.list_(pa.float64()))
-            columns.append(Column(entity, "scalars", pa.array(part), lists))
-    log, there = LogColumns(Contents(columns, torn=False, intact=True)), sorted(order.tolist())
-    for steps, rows in (log.matrix("a"), log.lists("a", "scalars")):
-        assert steps.tolist() == there
-        np.testing.assert_array_equal(rows, values[there])
-    np.testing.assert_array_equal(log.vectors("a"), values[:missing])
-    for length in (count, 5):  # what lies beyond the end is left out
-        expected = [values[k, 0] if k in there and told[k] else -1.0 for k in range(length)]
-        assert log.fill("s", "scalars", np.full(length, -1.0)).tolist() == expected
-
-
-@pytest.mark.parametrize("entity", [Entity.STATE, Entity.REFERENCE, Entity.INPUT, Entity.SOLVER])
-@pytest.mark.parametrize("lost", [1, 3])
-def test_a_run_is_as_long_as_the_shortest_of_its_columns(
-    entity: Entity, lost: int, tmp_path: Path, monkeypatch
-) -> None:
-    run, path = make_run(T=9), tmp_path / "run.rrd"
-    km.record(run, path)
-    rows = LogColumns.rows
-
-    def shortened(log: LogColumns, name: str, component: str = "scalars") -> tuple:
-        k, widths, values = rows(log, name, component)
-        if name.removeprefix("/") != entity or component != "scalars":
-            return k, widths, values
-        return k[:-lost], widths[:-lost], values[: int(widths[:-lost].sum())]
-
-    monkeypatch.setattr(LogColumns, "rows", shortened)
-    read, said = outcome(path)
-    assert said == [word(path, 9 - lost, 9, planned=" of 9")]
-    assert read == head(run, 9 - lost)
-
-
-def test_a_log_that_was_not_closed_says_so_though_all_steps_are_there(tmp_path: Path, monkeypatch) -> None:
-    run, path = make_run(T=9), tmp_path / "run.rrd"
-    km.record(run, path)
-    static = LogColumns.static
-    monkeypatch.setattr(
-        LogColumns, "static", lambda log, name, part: None if name == Entity.METRICS else static(log, name, part)
-    )
-    read, said = outcome(path)
-    assert said == [word(path, 9, 9, planned=" of 9")]
-    assert read == run

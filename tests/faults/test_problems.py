@@ -72,37 +72,14 @@ def test_the_forces_work_is_the_cart_poles_energy(theta, omega, velocity, u):
 
 
 @pytest.mark.parametrize("problem", [PENDULUM, CART_POLE], ids=lambda p: p.name)
-def test_references_are_equilibria_and_cases_fit(problem):
-    x, u = problem.equilibrium
-    np.testing.assert_allclose(rate(problem.dynamics, x, u), 0.0, atol=1e-12)
-    for name, case in problem.cases.items():  # f is affine in u: one input holds the reference, inside the limits
+def test_references_are_held_by_an_input_inside_the_limits(problem):
+    for name, case in problem.cases.items():  # f is affine in u
         free = rate(problem.dynamics, case.reference, [0.0])
         gain = rate(problem.dynamics, case.reference, [1.0]) - free
         held = -float(gain @ free) / float(gain @ gain)
         np.testing.assert_allclose(free + gain * held, 0.0, atol=1e-12)
         low, high = problem.limits_of(name).inputs(1)
         assert low[0] < held < high[0]
-
-
-@pytest.mark.parametrize("problem", [PENDULUM, CART_POLE], ids=lambda p: p.name)
-@given(theta=angle, u=st.floats(-40.0, 40.0))
-def test_scenes_have_the_same_finite_shapes_everywhere(problem, theta, u):
-    start = problem.dynamics.scene(problem.equilibrium[0], np.zeros(1))
-    x = problem.equilibrium[0] + theta
-    shapes = problem.dynamics.scene(x, np.array([u]))
-    assert [(type(s), s.name) for s in shapes] == [(type(s), s.name) for s in start]
-    assert len({s.name for s in shapes}) == len(shapes)
-
-
-def test_the_limits_are_the_ones_asked_for():
-    limits = {
-        f"{p.name}:{case}": tuple(float(v[0]) for v in p.limits_of(case).inputs(1))
-        for p in (PENDULUM, CART_POLE)
-        for case in p.cases
-    }
-    assert limits["pendulum:upright"] == (-25.0, 25.0)
-    assert limits["pendulum:hang"] == (-10.0, 10.0)
-    assert limits["cart_pole:recover"] == (-40.0, 40.0)
 
 
 def test_ten_newton_metres_cannot_hold_the_pendulum_level():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.base.errors import ShapeError
 
 STEPS = 60
 U_MAX = np.where(np.arange(STEPS + 1) < 30, 25.0, 6.0)[:, None]
@@ -54,5 +53,5 @@ def test_figures_draw_the_rows(run):
 
 def test_a_run_longer_than_its_limits_is_refused(plant):
     mpc = km.LinearMPC(plant, [0, 0], [0], COST, LIMITS.base, horizon=15)
-    with pytest.raises(ShapeError, match="the run reads rows 0 … 99, and row 61 is missing"):
+    with pytest.raises(km.errors.ShapeError, match="the run reads rows 0 … 99, and row 61 is missing"):
         km.simulate(plant, mpc, x0=[0, 0], reference=[0, 0], steps=100, limits=LIMITS)

@@ -128,7 +128,8 @@ class Prepared:
     @cached_property
     def truth(self) -> StepMap | Plant:
         """The problem's `plant`, by default its model."""
-        return self._make_step_map(self.problem.plant)
+        plant = self.problem.plant
+        return self.step_map if plant is None else _discretize(plant, self.problem)
 
     def truth_of(self, case: str) -> StepMap | Plant:
         """Return the plant of this case, by default the problem's."""
@@ -136,7 +137,7 @@ class Prepared:
         if plant is None:
             return self.truth
         if case not in self._plants:
-            self._plants[case] = self._make_step_map(plant)
+            self._plants[case] = _discretize(plant, self.problem)
         return self._plants[case]
 
     def perturb_plant(self, case: str, wrong: float, start: int) -> StepMap | Plant:
@@ -159,7 +160,7 @@ class Prepared:
             )
         e = np.random.default_rng([start, 1]).uniform(-wrong, wrong, len(values)).tolist()
         changed = {name: value * (1.0 + share) for (name, value), share in zip(values.items(), e, strict=True)}
-        return self._make_step_map(dataclasses.replace(cast("Any", own), **changed))
+        return _discretize(dataclasses.replace(cast("Any", own), **changed), problem)
 
     def initial_state(self, case: str, start: int) -> Float[np.ndarray, " nx"]:
         """Return an initial state: the case's own for 0, else one of the box that training data begin in."""
@@ -175,13 +176,6 @@ class Prepared:
         )
         low, high = np.asarray(ends.min(axis=0)), np.asarray(ends.max(axis=0))
         return low + (high - low) * rng.random(len(low))
-
-    def _make_step_map(self, plant: Dynamics | StepMap | Plant | None) -> StepMap | Plant:
-        if plant is None:
-            return self.step_map
-        if isinstance(plant, Dynamics):
-            return discretize(plant, self.problem.dt, self.problem.integrator)
-        return plant
 
     def u_reference(self, case: str) -> Float[np.ndarray, "T nu"]:
         """Return the inputs that hold the references of a case on its plant.
@@ -280,6 +274,10 @@ class Prepared:
         case = next((case for case in self.problem.cases if self.problem.limits_of(case) == limits), None)
         file = None if case is None else self._file(f"-{case}.npz")
         return None if file is None else load_controller(file)
+
+
+def _discretize(plant: Dynamics | StepMap | Plant, problem: Problem) -> StepMap | Plant:
+    return discretize(plant, problem.dt, problem.integrator) if isinstance(plant, Dynamics) else plant
 
 
 def _build_designed(parts: Prepared, limits: Limits) -> Controller:

@@ -21,21 +21,11 @@ BASELINE = "linear-mpc"  # compare with it if a problem has no nonlinear MPC
 
 @dataclass(frozen=True)
 class Standing:
-    """How a controller did on the cases of a problem in which the equations that it is given are the plant's.
+    """How a controller did on the cases of a problem in which the equations that it is given are the plant's."""
 
-    Attributes
-    ----------
-    ratio
-        Its cost over the baseline's, in the case where that is largest.
-    over
-        Whether it broke a limit on states that the baseline kept, in any of these cases.
-    time
-        Median time of its steps over that of the baseline's steps.
-    """
-
-    ratio: float
-    over: bool
-    time: float
+    ratio: float  # its cost over the baseline's, in the case where that is largest
+    over: bool  # it broke a limit on states that the baseline kept, in one of these cases
+    time: float  # median time of its steps over that of the baseline's steps
 
     def __str__(self) -> str:
         """Return e.g. ``"1.02"``, with a dagger where it broke a limit; ``"lost"`` from a hundred on."""

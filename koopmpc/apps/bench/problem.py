@@ -22,8 +22,6 @@ from koopmpc.plants.dynamics import RK4, Dynamics, Euler, Integrator
 from koopmpc.plants.plant import Plant
 from koopmpc.plants.step_map import StepMap, discretize
 
-_REST = 0.01  # share of 1 + |x| that a state may move by in one step from the equilibrium
-
 
 @dataclass(frozen=True, eq=False)
 class Training:
@@ -203,23 +201,7 @@ class Problem:
         cost.matrices(nr, nu)
         _fits(self.limits, self.dynamics, "limits")
         for name, case in self.cases.items():
-            if not name or any(sign.isspace() or sign in "/\\:" for sign in name):
-                raise DataError(
-                    f"a case is called {name!r}; its logs are named after it: leave out spaces, /, \\ and :"
-                )
-            size = np.shape(case.x0)
-            if size != (nx,):
-                raise ShapeError(f"case {name!r}: x0 has shape {size}, expected ({nx},): {self.dynamics.states}")
-            size = np.shape(case.reference) or (1,)
-            if size not in ((nr,), (case.steps + 1, nr)):
-                raise ShapeError(
-                    f"case {name!r}: reference has shape {size}, expected ({nr},) or (steps+1, nr) = "
-                    f"({case.steps + 1}, {nr}): the cost tracks {nr} outputs"
-                )
-            if case.limits is not None:
-                _fits(case.limits, self.dynamics, f"case {name!r}: limits")
-            _check_measured(case.measured, self.dynamics, (case.steps,), f"case {name!r}")
-            _check_plant(case.plant, nw, f"case {name!r}")
+            self._check_case(name, case, nr)
         _check_plant(self.plant, nw, "the problem")
         _check_measured(
             self.training.measured, self.dynamics, (self.training.episodes, self.training.steps), "training"
@@ -229,12 +211,29 @@ class Problem:
             raise DataError(f"angles holds {wrong[0]}; pass indices of states, 0 to {nx - 1}")
         self._check_rest(*rest)
 
+    def _check_case(self, name: str, case: Case, nr: int) -> None:
+        nx, what = self.dynamics.nx, f"case {name!r}"
+        if not name or any(sign.isspace() or sign in "/\\:" for sign in name):
+            raise DataError(f"a case is called {name!r}; its logs are named after it: leave out spaces, /, \\ and :")
+        size = np.shape(case.x0)
+        if size != (nx,):
+            raise ShapeError(f"{what}: x0 has shape {size}, expected ({nx},): {self.dynamics.states}")
+        size = np.shape(case.reference) or (1,)
+        if size not in ((nr,), (case.steps + 1, nr)):
+            raise ShapeError(
+                f"{what}: reference has shape {size}, expected ({nr},) or (steps+1, nr) = ({case.steps + 1}, {nr}): "
+                f"the cost tracks {nr} outputs"
+            )
+        _fits(case.limits or self.limits, self.dynamics, f"{what}: limits")
+        _check_measured(case.measured, self.dynamics, (case.steps,), what)
+        _check_plant(case.plant, self.dynamics.nw, what)
+
     def _check_rest(
         self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"] | None = None
     ) -> None:
         """Warn where the plant does not rest at the equilibrium: a state moves by 1 % of 1 + |x| in one step."""
         moved = discretize(self.dynamics, self.dt, Euler())(x, u, w) - x
-        if not (np.abs(moved) <= _REST * (1 + np.abs(x))).all():
+        if not (np.abs(moved) <= 0.01 * (1 + np.abs(x))).all():
             i = int(np.argmax(np.abs(moved) / (1 + np.abs(x))))
             warnings.warn(
                 f"the equilibrium does not rest: from it {self.dynamics.states[i]!r} moves by {moved[i]:.3g} in one "

@@ -3,7 +3,7 @@
 import csv
 import io
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from itertools import groupby
 from pathlib import Path
@@ -17,21 +17,15 @@ from rich.text import Text
 
 from koopmpc.apps.bench.store import ORACLE, RunRow, load_rows, manifest_of
 from koopmpc.base import disk
-from koopmpc.base.page import HtmlPage, Page
+from koopmpc.base.page import Page, PagePart
 from koopmpc.base.terminal import build_plain_table
 from koopmpc.base.text import format_duration
 from koopmpc.control.move import Fallback, Status
 from koopmpc.loop.metrics import Metrics
-from koopmpc.loop.run import Run
 from koopmpc.views.figures.reports import draw_attraction, draw_profiles, draw_step_times, draw_trajectories
 from koopmpc.views.figures.style import render_svg
 from koopmpc.views.recording.description import STATUS_WORDS
 from koopmpc.views.recording.reader import load_run
-
-_SURE = (0.025, 0.975)  # the ends of an interval
-_STARTS = 10  # from which a map of starts is drawn
-_BETTER = 0.9  # a cost below this share of nonlinear-mpc's is explained
-_LOGS = 12  # runs over one another, at most
 
 LEGEND = "cost: of the run; ratio: to nonlinear-mpc's, which knows the equations; off: error at the end."
 TIMES = "p50, p99: time of a step, in Python. `koopmpc explain WORD` explains every word, for example free."
@@ -68,22 +62,17 @@ def explain_results(rows: Sequence[RunRow]) -> RenderableType:
     return Group(*parts, Text(f"{LEGEND}\n{UNDER_FAULTS if broken else TIMES}", style="dim"))
 
 
-def _find_better(rows: Sequence[RunRow]) -> str | None:
-    """Return the first case, as ``"problem:case"``, in which a controller is clearly better than nonlinear-mpc."""
-    plain = [row for row in rows if row.fault is None and row.metrics is not None]
-    oracles = {(row.problem, row.case): row.metrics.cost for row in plain if row.controller == ORACLE and row.metrics}
-    for row in plain:
-        least = oracles.get((row.problem, row.case), -np.inf)
-        if row.metrics is not None and row.metrics.cost < _BETTER * least:
-            return f"{row.problem}:{row.case}"
-    return None
+def _find_better(rows: Sequence[RunRow], *, share: float = 0.9) -> str | None:
+    """Return the first case, as ``"problem:case"``, in which a cost is below this share of nonlinear-mpc's."""
+    costs = [(f"{row.problem}:{row.case}", row.metrics.cost, row) for row in rows if row.metrics and not row.fault]
+    oracles = {case: cost for case, cost, row in costs if row.controller == ORACLE}
+    return next((case for case, cost, _ in costs if cost < share * oracles.get(case, -np.inf)), None)
 
 
 def _case(title: str, rows: list[RunRow], unit: str) -> Table:
     lines = build_plain_table(title, (), padding=(0, 0, 0, 1))
     lines.add_column("controller", no_wrap=True)
-    measured = [row.metrics for row in rows if row.metrics is not None]
-    violated = any(figures.violation > 0 for figures in measured)
+    violated = any(row.metrics is not None and row.metrics.violation > 0 for row in rows)
     for heading in ("cost", "ratio", "settles", "off", *["over"] * violated, "p50", "p99"):
         lines.add_column(heading, justify="right", no_wrap=True)
     lines.add_column("steps")
@@ -192,7 +181,7 @@ def median_interval(values: Float[np.ndarray, " n"]) -> tuple[float, float, floa
         return float("nan"), float("nan"), float("nan")
     low, high = (
         ordered[int(np.ceil(n * betaincinv(m, n - m + 1, share))) - 1]
-        for share, m in zip(_SURE, ((n + 1) // 2, n // 2 + 1), strict=True)
+        for share, m in zip((0.025, 0.975), ((n + 1) // 2, n // 2 + 1), strict=True)
     )
     return float(np.median(ordered)), float(low), float(high)
 
@@ -206,35 +195,35 @@ def condition_of(row: RunRow) -> str:
 def summaries(rows: Sequence[RunRow]) -> list[Summary]:
     """Return a summary for each case, condition and controller."""
     best = {_pair(row): row.metrics.cost for row in rows if row.controller == ORACLE and row.metrics is not None}
-    found: list[Summary] = []
     groups: dict[tuple[str, str, str], list[RunRow]] = {}
     for row in rows:
         groups.setdefault((f"{row.problem}:{row.case}", condition_of(row), row.controller), []).append(row)
-    for key, own in groups.items():
-        figures = [row.metrics for row in own if row.metrics is not None]
-        costs = np.array([each.cost for each in figures])
-        oracle = np.array([best.get(_pair(row), np.nan) for row in own if row.metrics is not None])
-        with np.errstate(all="ignore"):
-            ratios = np.where(oracle > 0, costs / oracle, np.nan)
-        steps = sum(sum(each.status.values()) for each in figures)
-        kept = sum(each.fallback.get(Fallback.NONE.name, 0) for each in figures)
-        found.append(
-            Summary(
-                *key,
-                runs=len(own),
-                failed=sum(row.failure is not None for row in own),
-                reached=sum(row.reached for row in own) / len(own),
-                **dict(zip(("cost", "cost_low", "cost_high"), median_interval(costs), strict=True)),
-                **dict(zip(("ratio", "ratio_low", "ratio_high"), median_interval(ratios), strict=True)),
-                violation=_median([each.violation for each in figures]),
-                worst_violation=float(np.max([each.violation for each in figures], initial=0.0)),
-                fell_back=1.0 - kept / steps if steps else float("nan"),
-                p50=_median([each.solve_time_p50 for each in figures]),
-                p99=_median([each.solve_time_p99 for each in figures]),
-                cold_p50=_median([row.cold_p50 for row in own if np.isfinite(row.cold_p50)]),
-            )
-        )
-    return found
+    return [_summarise(key, own, best) for key, own in groups.items()]
+
+
+def _summarise(key: tuple[str, str, str], rows: Sequence[RunRow], best: Mapping[tuple[Any, ...], float]) -> Summary:
+    """Return the summary of these runs; `best` holds the costs of nonlinear-mpc by `_pair`."""
+    ended = [row for row in rows if row.metrics is not None]
+    figures = [row.metrics for row in ended if row.metrics is not None]
+    costs, oracle = np.array([each.cost for each in figures]), np.array([best.get(_pair(row), np.nan) for row in ended])
+    with np.errstate(all="ignore"):
+        ratios = np.where(oracle > 0, costs / oracle, np.nan)
+    steps = sum(sum(each.status.values()) for each in figures)
+    kept = sum(each.fallback.get(Fallback.NONE.name, 0) for each in figures)
+    return Summary(
+        *key,
+        runs=len(rows),
+        failed=sum(row.failure is not None for row in rows),
+        reached=sum(row.reached for row in rows) / len(rows),
+        **dict(zip(("cost", "cost_low", "cost_high"), median_interval(costs), strict=True)),
+        **dict(zip(("ratio", "ratio_low", "ratio_high"), median_interval(ratios), strict=True)),
+        violation=_median([each.violation for each in figures]),
+        worst_violation=float(np.max([each.violation for each in figures], initial=0.0)),
+        fell_back=1.0 - kept / steps if steps else float("nan"),
+        p50=_median([each.solve_time_p50 for each in figures]),
+        p99=_median([each.solve_time_p99 for each in figures]),
+        cold_p50=_median([row.cold_p50 for row in rows if np.isfinite(row.cold_p50)]),
+    )
 
 
 def _median(values: Sequence[float]) -> float:
@@ -308,72 +297,56 @@ def write_report(folder: str | Path) -> Path:
     out.writerows(astuple(each) for each in found)
     with disk.writing(folder / "summary.csv") as stream:
         stream.write(table.getvalue().encode())
-    page, html = Page(folder), HtmlPage("Sweep")
-    intro = _intro(rows, about)
-    page.text("# Sweep", *intro)
-    html.text(*intro)
-    for section in _sections(rows, found, folder):
-        page.text(f"## {section.title}")
-        html.heading(section.title)
-        page.table(section.headings, section.lines)
-        html.table(section.headings, section.lines, words=True)
-        html.pictures(section.pictures)
-        if section.logs:
-            page.text("Logs: " + ", ".join(f"[{log}]({log})" for log in section.logs))
-            html.links(f"{len(section.logs)} logs", section.logs)
-    page.write()
-    return html.write(folder / "report.html")
-
-
-@dataclass(frozen=True)
-class _Section:
-    """A heading, a table under it, and pictures with their captions."""
-
-    title: str
-    headings: tuple[str, ...]
-    lines: list[tuple[str, ...]]
-    pictures: list[tuple[str, str]]
-    logs: list[str]
-
-
-def _sections(rows: Sequence[RunRow], found: Sequence[Summary], folder: Path) -> Iterable[_Section]:
-    for title, group in groupby(found, key=lambda each: each.case):
+    page = Page(folder, title="Sweep")
+    page.parts.append(PagePart("# Sweep"))
+    page.text(*_intro(rows, about))
+    cases = [(title, list(group)) for title, group in groupby(found, key=lambda each: each.case)]
+    for title, group in cases:
         own = [row for row in rows if f"{row.problem}:{row.case}" == title]
-        usual = [row for row in own if condition_of(row) == "–"] or own
-        lines = [_summary_cells(summary) for summary in group]
-        logs = [row.log.name for row in own if row.log is not None and row.log.is_file()]
-        yield _Section(title, _HEADINGS, lines, list(_pictures(own, usual, folder)), logs)
-    whole = list(_profile(rows)) if len({each.case for each in found}) > 1 else []
-    yield _Section("All cases", ("case", "controller", "steps", "how steps ended"), list(_statuses(rows)), whole, [])
+        page.heading(title)
+        page.table(_HEADINGS, [_summary_cells(summary) for summary in group], words=True)
+        page.pictures(_draw_case(own, folder))
+        if logs := [row.log.name for row in own if row.log is not None and row.log.is_file()]:
+            page.links("logs", logs)
+    page.heading("All cases")
+    page.table(("case", "controller", "steps", "how steps ended"), list(_statuses(rows)), words=True)
+    page.pictures(_profile(rows) if len(cases) > 1 else ())
+    page.write()
+    return page.write("report.html")
 
 
-def _pictures(own: Sequence[RunRow], usual: Sequence[RunRow], folder: Path) -> Iterable[tuple[str, str]]:
-    """Yield pictures of one case as SVG with their captions."""
-    names = list(dict.fromkeys(row.controller for row in own))
+def _draw_case(own: Sequence[RunRow], folder: Path, *, most: int = 12, starts: int = 10) -> Iterable[tuple[str, str]]:
+    """Yield pictures of the runs of one case as SVG with their captions.
+
+    At most `most` runs lie over one another, and a map of starts is drawn of controllers with at least `starts` runs.
+    """
     yield from _profile(own)
-    measured = {name: [row for row in usual if row.controller == name and row.metrics is not None] for name in names}
-    hot = {name: np.array([r.metrics.solve_time_p50 for r in own if r.metrics]) for name, own in measured.items()}
-    cold = {name: np.array([row.cold_p50 for row in own]) for name, own in measured.items()}
-    yield (
-        render_svg(draw_step_times(hot, cold)),
-        "Time of a step: median over runs, middle half, and 5 to 95 %; × with cold caches.",
-    )
-    starts = {name: np.array([row.x0 for row in own]) for name, own in measured.items() if len(own) >= _STARTS}
-    runs = _load_logged(usual, folder)
-    if starts and next(iter(starts.values())).shape[1] > 1:
-        spread = np.ptp(np.vstack(list(starts.values())), axis=0)
-        i, j = (int(k) for k in np.sort(np.argsort(-spread, kind="stable")[:2]))
-        named: tuple[str, ...] = next(iter(runs.values())).states if runs else ()
-        states: list[str] = [*named, *(f"state {k}" for k in range(len(named), len(spread)))]
-        reached = {name: np.array([row.reached for row in measured[name]]) for name in starts}
-        mapped = {name: (values[:, [i, j]], reached[name]) for name, values in starts.items()}
-        alone = "" if len(usual) == len(own) else ", without noise and with the plant as it is"
-        yield (
-            render_svg(draw_attraction(mapped, [states[i], states[j]])),
-            f"Initial states that reach their reference, and not{alone}.",
-        )
+    usual = [row for row in own if condition_of(row) == "–"] or own
+    measured = [row for row in usual if row.metrics is not None]
+    ended = {row.controller: [each for each in measured if each.controller == row.controller] for row in own}
+    hot = {name: np.array([r.metrics.solve_time_p50 for r in rows if r.metrics]) for name, rows in ended.items()}
+    cold = {name: np.array([row.cold_p50 for row in rows]) for name, rows in ended.items()}
+    times = "Time of a step: median over runs, middle half, and 5 to 95 %; × with cold caches."
+    yield render_svg(draw_step_times(hot, cold)), times
+    logs = {row.controller: folder / f"{row.name}.rrd" for row in usual if row.start == row.seed == 0}
+    runs = {name: load_run(log) for name, log in [*logs.items()][:most] if log.is_file()}
+    many = {name: rows for name, rows in ended.items() if len(rows) >= starts}
+    alone = "" if len(usual) == len(own) else ", without noise and with the plant as it is"
+    if many and len(next(iter(many.values()))[0].x0) > 1:
+        states = next(iter(runs.values())).states if runs else ()
+        yield _draw_starts(many, states), f"Initial states that reach their reference, and not{alone}."
     if runs:
         yield render_svg(draw_trajectories(runs)), "The case's own start."
+
+
+def _draw_starts(rows: Mapping[str, Sequence[RunRow]], named: Sequence[str]) -> str:
+    """Return a map of starts over the two states that differ most among them."""
+    starts = {name: np.array([row.x0 for row in own]) for name, own in rows.items()}
+    spread = np.ptp(np.vstack(list(starts.values())), axis=0)
+    shown = np.sort(np.argsort(-spread, kind="stable")[:2])
+    states: list[str] = [*named, *(f"state {k}" for k in range(len(named), len(spread)))]
+    mapped = {name: (starts[name][:, shown], np.array([row.reached for row in own])) for name, own in rows.items()}
+    return render_svg(draw_attraction(mapped, [states[int(k)] for k in shown]))
 
 
 def _profile(rows: Sequence[RunRow]) -> Iterable[tuple[str, str]]:
@@ -393,12 +366,6 @@ def _profile(rows: Sequence[RunRow]) -> Iterable[tuple[str, str]]:
             render_svg(made),
             "Performance profile: the share of runs whose cost is within τ of the best controller's.",
         )
-
-
-def _load_logged(usual: Sequence[RunRow], folder: Path) -> dict[str, Run]:
-    """Return the runs from the case's own start that have a log, by controller."""
-    own = [row for row in usual if row.start == row.seed == 0 and row.log is not None and row.log.is_file()]
-    return {row.controller: load_run(folder / row.log.name) for row in own[:_LOGS] if row.log is not None}
 
 
 def _statuses(rows: Sequence[RunRow]) -> Iterable[tuple[str, ...]]:
@@ -433,11 +400,8 @@ def _intro(rows: Sequence[RunRow], about: dict[str, Any]) -> list[str]:
         + ", ".join(f"{name} {number}" for name, number in machine["versions"].items())
         + ".",
     ]
-    doubt: list[str] = []
-    if machine["load"] > machine["cores"]:
-        doubt.append(f"the load was {machine['load']} on {machine['cores']} cores")
-    if machine["blas_threads"] != "1":
-        doubt.append("BLAS was not limited to one thread")
+    doubt = [f"the load was {machine['load']} on {machine['cores']} cores"] * (machine["load"] > machine["cores"])
+    doubt += ["BLAS was not limited to one thread"] * (machine["blas_threads"] != "1")
     if doubt:
         lines.append(f"Step times are not to be trusted: {', and '.join(doubt)}.")
     lines += [f"{row.name} failed: {row.failure}" for row in failed[:20]]

@@ -57,12 +57,13 @@ _SLEEP = 0.004  # sleep before each of them [s]
 _TOLERANCE = 1e-9  # relative violation of an input limit that counts as rounding
 
 
-def measure_run(parts: Prepared, row: RunRow, folder: Path, *, logged: bool, **how: bool) -> tuple[RunRow, Run | None]:
-    """Run what `row` names; return it with its figures, and the run, which `log_run` takes.
+def run_and_log(parts: Prepared, row: RunRow, folder: Path, *, logged: bool, **how: bool) -> RunRow:
+    """Run what `row` names, and return it with its figures; `how` is passed to `run_closed_loop`.
 
-    An exception becomes the row's failure, and there is no run. The rest is passed to `run_closed_loop`.
+    A run that is `logged`, or that failed, is written to a log, which is read back; one that is logged is also timed
+    with cold caches. An exception becomes the row's failure.
     """
-    begin = time.perf_counter()
+    begin, log = time.perf_counter(), folder / f"{row.name}.rrd"
     row = replace(row, x0=tuple(parts.initial_state(row.case, row.start).tolist()))
     try:
         run = run_closed_loop(parts, row, plans=logged, **how)
@@ -71,28 +72,7 @@ def measure_run(parts: Prepared, row: RunRow, folder: Path, *, logged: bool, **h
     except FullDiskError:
         raise
     except Exception as error:  # the other runs go on; the exit code says that one failed
-        failure = _describe_error(error, folder / f"{row.name}.rrd")
-        return replace(row, failure=failure, elapsed=time.perf_counter() - begin), None
-    measured = replace(
-        row,
-        metrics=figures,
-        reached=arrived,
-        training_time=parts.training_time if is_learned(row.controller) else 0.0,
-        failure="; ".join(found) or None,
-        elapsed=time.perf_counter() - begin,
-    )
-    return measured, run
-
-
-def log_run(parts: Prepared, row: RunRow, run: Run, folder: Path, *, logged: bool) -> RunRow:
-    """Return the row of `measure_run` with its log.
-
-    A run that is `logged`, or that failed, is written to a log, which is read back; one that is logged is also timed
-    with cold caches.
-    """
-    begin = time.perf_counter()
-    log = folder / f"{row.name}.rrd"
-    found = [] if row.failure is None else [row.failure]
+        return replace(row, failure=_describe_error(error, log), elapsed=time.perf_counter() - begin)
     if logged or found:
         try:
             found += _record_log(run, log)
@@ -106,9 +86,12 @@ def log_run(parts: Prepared, row: RunRow, run: Run, folder: Path, *, logged: boo
     p50, p99 = _cold(parts.controller(row.controller, row.case), run) if usual else (row.cold_p50, row.cold_p99)
     return replace(
         row,
+        metrics=figures,
+        reached=arrived,
+        training_time=parts.training_time if is_learned(row.controller) else 0.0,
         log=log if log.exists() else None,
         failure="; ".join(found) or None,
-        elapsed=row.elapsed + time.perf_counter() - begin,
+        elapsed=time.perf_counter() - begin,
         cold_p50=p50,
         cold_p99=p99,
     )

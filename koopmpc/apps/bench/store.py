@@ -3,8 +3,8 @@
 The process that sweeps writes alone, a transaction a run: kill -9 loses only runs that are under way. It always has a
 transaction open, so that a second sweep in the folder is refused, while others may read. The journal is SQLite's
 rollback journal, for a write-ahead log needs memory that network folders do not share. Each text is kept with its
-checksum: a row that does not match is reported and left out. The table, results.parquet, is a copy of the rows; it is
-written now and then and at the end, and renamed when complete.
+checksum: a row that does not match is reported and left out. The table, results.parquet, is a copy of the rows, written
+at the end and renamed when complete.
 """
 
 import json
@@ -145,7 +145,6 @@ _KINDS: dict[str, type] = {
     "start": int, "x0": np.ndarray, **_FIGURES, "status": Status, "fallback": Fallback, "reached": bool,
     "training_time": float, "elapsed": float, "cold_p50": float, "cold_p99": float, "log": str, "failure": str,
 }  # fmt: skip
-_ROWS = 5000  # in a group of the table
 
 
 def write_results(rows: Sequence[RunRow], path: Path) -> None:
@@ -158,14 +157,13 @@ def write_results(rows: Sequence[RunRow], path: Path) -> None:
     plain = {str: pa.string(), float: pa.float64(), int: pa.int64(), bool: pa.bool_(), np.ndarray: vector}
     counts = {kind: pa.struct([(each.name, pa.int64()) for each in kind]) for kind in (Status, Fallback)}
     schema = pa.schema([(name, (plain | counts)[kind]) for name, kind in _KINDS.items()])
-    with disk.writing(path) as stream, pq.ParquetWriter(stream, schema, write_page_checksum=True) as writer:
-        for first in range(0, max(len(rows), 1), _ROWS):
-            records = [record_of(row) for row in rows[first : first + _ROWS]]
-            for record in records:
-                for kind, name in ((Status, "status"), (Fallback, "fallback")):
-                    if record[name] is not None:
-                        record[name] = {each.name: record[name].get(each.name, 0) for each in kind}
-            writer.write_table(pa.Table.from_pylist(records, schema=schema))
+    records = [record_of(row) for row in rows]
+    for record in records:
+        for kind, name in ((Status, "status"), (Fallback, "fallback")):
+            if record[name] is not None:
+                record[name] = {each.name: record[name].get(each.name, 0) for each in kind}
+    with disk.writing(path) as stream:
+        pq.write_table(pa.Table.from_pylist(records, schema=schema), stream, write_page_checksum=True)
 
 
 def record_of(row: RunRow) -> dict[str, Any]:

@@ -2,11 +2,10 @@
 
 import json
 import pickle
-import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import lru_cache, partial
 from itertools import groupby, product
 from pathlib import Path
@@ -19,20 +18,16 @@ from koopmpc.apps.bench.controllers import Prepared, controller_names, is_learne
 from koopmpc.apps.bench.options import SweepOptions
 from koopmpc.apps.bench.problem import Problem
 from koopmpc.apps.bench.problem_files import load_problem
-from koopmpc.apps.bench.single import FAULTS, log_run, measure_run
+from koopmpc.apps.bench.single import FAULTS, run_and_log
 from koopmpc.apps.bench.store import RESULTS, RunRow, Store, open_sweep, write_results
 from koopmpc.base import checks, disk
 from koopmpc.base.errors import DataError, ProblemError, WorkerError, refuse_moved
 from koopmpc.base.parallel import map_tasks
 from koopmpc.base.values import fingerprint, to_data
 from koopmpc.control.ask.limits import Limits
-from koopmpc.loop.run import Run
 from koopmpc.views.recording.viewer import find_viewer, why_none
 
 MODELS = "models"  # beside the logs: what was learned
-_FIRST = 5.0  # write results.parquet for the first time after this time [s]
-_SHARE = 100.0  # write results.parquet again after this many times the time that writing takes
-_HELD = 3.0  # let logs wait for the table of their case while its loops take less than this time [s]
 _NOT_ASKED = ("workers", "scheduler", "live", "paced", "log_starts")  # options that change no figure of a run
 
 
@@ -76,8 +71,7 @@ def sweep(
     progress
         Called with (name of the run, runs done, runs in all).
     on_case
-        Called with all runs of a case when the last one has ended; cases come in their order. In this process it does
-        not wait for the logs of loops that take less than three seconds: they come afterwards, after Ctrl-C, too.
+        Called with all runs of a case when the last one has ended; cases come in their order.
     **moved
         Refused: what were keywords are fields of `options`.
 
@@ -115,46 +109,39 @@ def sweep(
         shown = _Shown(rows, store, progress, on_case)
         left = [row for row in rows if row.key not in store.rows]
         shown.say(left[0].name if left else "done")
-        due = time.monotonic() + _FIRST
         try:
             _learn_all(grid, asked["controllers"], left)
-            here = options.is_here and on_case is not None
-            for row in _run_here(grid, left, shown) if here else _send_runs(grid, left):
-                shown.end(store.add(row))
-                if (begin := time.monotonic()) >= due:
-                    write_results(_in_order(rows, store.rows), folder / RESULTS)
-                    due = begin + _SHARE * (time.monotonic() - begin)
+            for row in _send_runs(grid, left):
+                store.add(row)
+                shown.say(row.name)
         finally:
-            write_results(_in_order(rows, store.rows), folder / RESULTS)
-        return _in_order(rows, store.rows)
+            write_results(shown.list_ended(rows), folder / RESULTS)
+        return shown.list_ended(rows)
 
 
+@dataclass
 class _Shown:
     """What callers see of a sweep that goes on: names, numbers, and cases that have ended."""
 
-    def __init__(
-        self,
-        rows: Sequence[RunRow],
-        store: Store,
-        progress: Callable[[str, int, int], None] | None,
-        on_case: Callable[[list[RunRow]], None] | None,
-    ) -> None:
-        self._count, self._progress, self._on_case = len(rows), progress, on_case
-        self._ended = store.rows.copy()
-        self._cases = [list(group) for _, group in groupby(rows, key=_case_of)]
+    rows: list[RunRow]
+    store: Store
+    progress: Callable[[str, int, int], None] | None
+    on_case: Callable[[list[RunRow]], None] | None
 
-    def end(self, row: RunRow) -> None:
-        """Show that a run has ended, whose log may still be written."""
-        if row.key not in self._ended:
-            self._ended[row.key] = row
-            self.say(row.name if len(self._ended) < self._count else "done")
+    def __post_init__(self) -> None:
+        self._cases = [list(group) for _, group in groupby(self.rows, key=lambda row: (row.problem, row.case))]
 
     def say(self, what: str) -> None:
         """Show what runs or has ended."""
-        if self._progress is not None:
-            self._progress(what.replace("-", ":", 1), len(self._ended), self._count)
-        while self._on_case is not None and self._cases and all(row.key in self._ended for row in self._cases[0]):
-            self._on_case(_in_order(self._cases.pop(0), self._ended))
+        done, total = len(self.store.rows), len(self.rows)
+        if self.progress is not None:
+            self.progress(what.replace("-", ":", 1) if done < total else "done", done, total)
+        while self.on_case is not None and self._cases and all(row.key in self.store.rows for row in self._cases[0]):
+            self.on_case(self.list_ended(self._cases.pop(0)))
+
+    def list_ended(self, rows: Sequence[RunRow]) -> list[RunRow]:
+        """Return the finished ones of these runs, in the order in which they were asked for."""
+        return [self.store.rows[row.key] for row in rows if row.key in self.store.rows]
 
 
 def _list_runs(problems: Sequence[Problem], controllers: Sequence[str] | None, options: SweepOptions) -> list[RunRow]:
@@ -166,18 +153,14 @@ def _list_runs(problems: Sequence[Problem], controllers: Sequence[str] | None, o
         raise ProblemError(f"{twice} comes twice, and its logs would have one name; run it once, or rename a file")
     rows: list[RunRow] = []
     for problem, case in ((each, case) for each in problems for case in each.cases):
+        if any(options.wrong):
+            Prepared(problem).perturb_plant(case, 0.0, 0)  # raises where there is nothing to be wrong
         names = asked if controllers else controller_names(problem.controllers)
         broken = (None, *(possible_faults(problem.limits_of(case)) if options.faults else ()))
         for fault, n, w, seed, name in product(broken, options.noise, options.wrong, range(options.seeds), names):
-            if seed and not is_learned(name):
-                continue  # it learns nothing, so all seeds are one
-            row = RunRow(problem.name, case, name, fault=fault, noise=n, wrong=w, seed=seed)
-            rows.extend(replace(row, start=start) for start in range(options.starts))
-    if any(options.wrong):
-        for problem in problems:
-            parts = Prepared(problem)
-            for case in problem.cases:
-                parts.perturb_plant(case, 0.0, 0)  # raises where there is nothing to be wrong
+            if not seed or is_learned(name):  # of what learns nothing all seeds are one
+                row = RunRow(problem.name, case, name, fault=fault, noise=n, wrong=w, seed=seed)
+                rows.extend(replace(row, start=start) for start in range(options.starts))
     return rows
 
 
@@ -270,62 +253,7 @@ def _send_runs(grid: _Grid, rows: Sequence[RunRow]) -> Iterator[RunRow]:
 
 
 def _run(grid: _Grid, row: RunRow) -> RunRow:
-    return _log(grid, *_measure(grid, row))
-
-
-def _run_here(grid: _Grid, rows: Sequence[RunRow], shown: _Shown) -> Iterator[RunRow]:
-    """Yield each run; logs of a case wait for its table while its loops and logs take less than `_HELD`.
-
-    Ctrl-C writes those that wait; a second one keeps their figures without logs.
-    """
-    waiting: list[tuple[RunRow, Run | None]] = []
-
-    def log_waiting() -> Iterator[RunRow]:
-        while waiting:
-            row = _log(grid, *waiting[0])
-            waiting.pop(0)
-            yield row
-
-    for _, case in groupby(rows, key=_case_of):
-        due = time.monotonic() + _HELD
-        try:
-            for row in case:
-                waiting.append(_measure(grid, row))
-                shown.end(waiting[-1][0])
-                if time.monotonic() >= due:
-                    yield from log_waiting()
-            yield from log_waiting()
-        except KeyboardInterrupt:
-            try:
-                yield from log_waiting()
-            except KeyboardInterrupt:
-                yield from (row for row, _ in waiting)
-            raise
-
-
-def _measure(grid: _Grid, row: RunRow) -> tuple[RunRow, Run | None]:
-    """Return the row with its figures, and its run, None where it raised."""
+    """Return the row with its figures, and its log where it has one."""
+    parts = _prepare(grid.name, grid.problems[f"{row.problem}:{row.case}"], row.seed, grid.folder, grid.options.monitor)
     how = {name: getattr(grid.options, name) for name in ("live", "paced", "compiled")}
-    logged = row.start < grid.options.log_starts
-    return measure_run(_parts_of(grid, row), row, grid.folder, logged=logged, **how)
-
-
-def _log(grid: _Grid, row: RunRow, run: Run | None) -> RunRow:
-    """Return the row of a run that has ended, with its log where it has one."""
-    if run is None:
-        return row
-    return log_run(_parts_of(grid, row), row, run, grid.folder, logged=row.start < grid.options.log_starts)
-
-
-def _parts_of(grid: _Grid, row: RunRow) -> Prepared:
-    sent = grid.problems[f"{row.problem}:{row.case}"]
-    return _prepare(grid.name, sent, row.seed, grid.folder, grid.options.monitor)
-
-
-def _case_of(row: RunRow) -> tuple[str, str]:
-    return row.problem, row.case
-
-
-def _in_order(rows: Sequence[RunRow], ended: Mapping[tuple[Any, ...], RunRow]) -> list[RunRow]:
-    """Return the finished runs, in the order in which they were asked for."""
-    return [ended[row.key] for row in rows if row.key in ended]
+    return run_and_log(parts, row, grid.folder, logged=row.start < grid.options.log_starts, **how)

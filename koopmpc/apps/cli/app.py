@@ -118,7 +118,7 @@ def fit(
 
     if goal_template:
         with friendly():
-            path = new_file(Path("goal.toml"), write_template(source, options, say=say_line))
+            path = new_file(Path("goal.toml"), write_template(source, options, say_line))
         say(f"written: {path}; say in it what you want")
         more = ["--linear"] * options.linear + ["--feedthrough"] * options.feedthrough
         for option, value, usual in (
@@ -134,14 +134,14 @@ def fit(
             if (horizon := options.horizon) is not None:
                 raise DataError(f"--horizon {horizon} is of no use with --goal; write horizon = {horizon} into {goal}")
         with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
-            designed = design_data(source, goal, folder, options, say=say_line, progress=progress)
+            designed = design_data(source, goal, folder, options, say_line, progress)
         say(f"controller: {designed.controller}, report: {designed.page}")
         say(f"check it: {format_command('check', designed.controller)}\nuse it:\n{designed.usage}")
     else:
         with friendly():
             options.refuse_design()
         with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
-            done = fit_data(source, folder, options, say=say_line, progress=progress)
+            done = fit_data(source, folder, options, say_line, progress)
         for failure in done.failures:
             Console(stderr=True).print(Text.assemble(("not made: ", "yellow"), failure), soft_wrap=True)
         say(f"model, report and pictures: {folder}")

@@ -18,21 +18,13 @@ def take_options(
     kind: type,
     only: Collection[str] | None = None,
     *,
-    flags: Mapping[str, str] | None = None,
     help: Mapping[str, str] | None = None,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command an option for each field of a dataclass; the command gets them as one object, `options`.
 
     A sequence is written with commas between its items; an empty text is an empty sequence.
-
-    Parameters
-    ----------
-    kind
-        The dataclass; the docstring's section Attributes says what each field means.
-    only
-        Names of the fields that are options; all by default. The others keep their defaults.
-    flags, help
-        By name of the field, what takes the place of ``--name``, and of the first sentence in the docstring.
+    Fields that are not among `only` keep their defaults. The help is the first sentence of what the docstring says of a
+    field in its section Attributes, or what `help` has by its name.
     """
     hints, meanings = get_type_hints(kind), {**read_attributes(kind), **(help or {})}
     chosen = [field for field in fields(kind) if field.init and (only is None or field.name in only)]
@@ -44,8 +36,7 @@ def take_options(
         if field.name in items:
             default = None if default is None else ",".join(map(str, default))
             hint = str | None if default is None else str
-        flag = (flags or {}).get(field.name, f"--{field.name.replace('_', '-')}")
-        option = typer.Option(flag, help=meanings[field.name])
+        option = typer.Option(f"--{field.name.replace('_', '-')}", help=meanings[field.name])
         parameters.append(
             Parameter(field.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[hint, option])
         )

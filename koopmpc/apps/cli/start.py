@@ -70,10 +70,10 @@ def doctor() -> None:
     ]
     compiler = find_compiler()
     lacks = "none of $CC, cc, gcc, clang is there" if compiler is None else try_compiler(compiler)
-    if compiler is not None and not lacks:
-        rows.append((True, "C compiler", f"{' '.join(compiler)}: km.compiled, --compiled, and plants at full speed"))
-    else:
-        rows.append((False, "C compiler", f"{lacks}; until one works: no km.compiled, and slower plants"))
+    well = f"{' '.join(compiler or ())}: km.compiled, --compiled, and plants at full speed"
+    rows.append(
+        (not lacks, "C compiler", f"{lacks}; until one works: no km.compiled, and slower plants" if lacks else well)
+    )
     there = program().exists()
     shown = sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     what = "opens logs" if there and shown else "no display: logs are written all the same" if there else "not found"
@@ -83,7 +83,7 @@ def doctor() -> None:
     rows.append((threads == "1", "BLAS threads", f"{said}; {os.cpu_count()} processors"))
     for extra in EXTRAS:
         found = all(find_spec(module) is not None for module in extra.modules)
-        rows.append((found, extra.extra, extra.purpose if found else f"{extra.purpose}: {install(extra.extra)}"))
+        rows.append((found, extra.extra, extra.purpose + f": {install(extra.extra)}" * (not found)))
     table = Table.grid(padding=(0, 1))
     for good, name, says in rows:
         mark = Text("✓", "green") if good else Text("–", "yellow")

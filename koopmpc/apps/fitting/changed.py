@@ -16,21 +16,11 @@ _OFF = 0.2  # runs with inputs off by this share say whether a design bears such
 
 @dataclass(frozen=True, eq=False)
 class ComparedLogs:
-    """What new logs say of a design.
+    """What new logs say of a design."""
 
-    Attributes
-    ----------
-    report
-        What changed.
-    holds
-        True, False, or None where nobody can say.
-    sentence
-        The result in words.
-    """
-
-    report: DriftReport
-    holds: bool | None
-    sentence: str
+    report: DriftReport  # what changed
+    holds: bool | None  # None where nobody can say
+    sentence: str  # the result in words
 
 
 def compare_logs(old: Episodes | None, new: Episodes, kept: Sequence[str]) -> ComparedLogs:
@@ -39,19 +29,7 @@ def compare_logs(old: Episodes | None, new: Episodes, kept: Sequence[str]) -> Co
     It holds where nothing has changed; where the gain of an input has, by at most a fifth, it holds if the runs with
     inputs 20 % off keep the goal.
 
-    Parameters
-    ----------
-    old
-        The logs of the design, in its evidence.
-    new
-        New logs, with the states and inputs of the design in their order.
-    kept
-        Names of the kinds of runs that keep the goal.
-
-    Raises
-    ------
-    DataError
-        The design was saved without its logs.
+    `kept` names the kinds of runs that keep the goal.
     """
     if old is None:
         raise DataError("the design was saved without its logs, so new ones cannot be compared; design again, and save")
@@ -72,15 +50,7 @@ def compare_logs(old: Episodes | None, new: Episodes, kept: Sequence[str]) -> Co
 
 
 def read_new_logs(path: str | PathLike[str], files: Sequence[str | PathLike[str]]) -> Episodes:
-    """Return logs with the states and inputs of a saved design, in its order; columns that it lacks are left out.
-
-    Raises
-    ------
-    DataError
-        A column of the design is missing, or the file holds no design with its logs.
-    LogError
-        A file cannot be read.
-    """
+    """Return logs with the states and inputs of a saved design, in its order; columns that it lacks are left out."""
     own = _logs_of(path)
     if own is None:
         raise DataError(f"{path} holds no logs of a design, so new ones cannot be compared; design again, and save")
@@ -92,13 +62,7 @@ def read_new_logs(path: str | PathLike[str], files: Sequence[str | PathLike[str]
 
 
 def read_plant_runs(path: str | PathLike[str], files: Sequence[str | PathLike[str]]) -> Episodes:
-    """Return logged runs of a saved design on its plant; columns of tables have the names that it gave them.
-
-    Raises
-    ------
-    DataError, LogError
-        A file cannot be read, or lacks a column of the design.
-    """
+    """Return logged runs of a saved design on its plant; columns of tables have the names that it gave them."""
     own = _logs_of(path)
     return load_episodes(*files) if own is None else load_alike(files, own)
 

@@ -27,7 +27,7 @@ from koopmpc.apps.fitting.report import write_design_report
 from koopmpc.apps.fitting.verdict import judge_plant_runs, judge_rate, plan_verdict
 from koopmpc.base import checks
 from koopmpc.base.errors import LogError
-from koopmpc.base.page import HtmlPage
+from koopmpc.base.page import Page
 from koopmpc.base.parallel import StageProgress
 from koopmpc.base.text import format_duration, to_percent
 from koopmpc.control.ask.limits import Interval
@@ -57,7 +57,6 @@ def check_controller(
     rate: float = 0.05,
     on_plant: Episodes | None = None,
     progress: StageProgress | None = None,
-    rng: np.random.Generator | int = 0,
 ) -> Checked:
     """Run a saved design on its surrogates from random starts, in every kind of run, and judge the results.
 
@@ -80,35 +79,12 @@ def check_controller(
     more than 5 %, are listed separately; they count if `faults` is true. The surrogates are learned from the same logs
     as the controller, and may share its errors.
 
-    Parameters
-    ----------
-    path
-        The file of a design.
-    folder
-        Where report.html is written, the report of the design with the verdict on top.
-    runs
-        How many runs there are of each kind.
-    faults
-        Whether the goal is to be kept with faults as well.
-    new
-        New logs of the plant, to see whether it has changed since the design; states and inputs of the design.
-    rate
-        Wished bound on the share of loops that break a limit or are lost; it says how many fresh loops are run.
-    on_plant
-        Logged runs of this controller on its plant, each an episode; they are judged beside the stand-ins.
-    progress
-        Called with what is done, how many of it are, and how many there are.
-    rng
-        Draws starts, noise and faults.
-
-    Raises
-    ------
-    LogError
-        The file holds no design, or is damaged.
-    DataError
-        The logged runs are not of this controller.
+    `runs` is the number of runs of each kind, and `rate` the wished bound on the share of loops that break a limit or
+    are lost, which says how many fresh loops are run. `new` logs of the plant say whether it has changed since the
+    design, and `on_plant` are logged runs of this controller on its plant, each an episode. `progress` is called with
+    what is done, how many of it are, and how many there are.
     """
-    saved, draw, runs = read_controller(path), checks.generator(rng), checks.count(runs, "runs")
+    saved, draw, runs = read_controller(path), np.random.default_rng(0), checks.count(runs, "runs")
     if not isinstance(saved, SavedDesign):
         raise LogError(
             f"{path} holds a controller without the evidence that a check needs; pass what `koopmpc fit --goal` or the "
@@ -362,12 +338,12 @@ def _say_off(one: Figures) -> str:
 def _write_page(result: Checked, path: str | Path, saved: SavedDesign, controller: AnyMPC) -> None:
     """Write the report of the design with the verdict of the check on top."""
 
-    def add_verdict(page: HtmlPage) -> None:
+    def add_verdict(page: Page) -> None:
         kind = {"kept": "good", "not kept": "bad", "cannot say": "doubt"}[result.verdict]
         reasons = [*result.reasons, *result.doubts, *result.remarks] or ["Nothing speaks against it."]
         page.verdict(kind, f"{_VERDICTS[result.verdict].capitalize()}.", *reasons)
 
-    def add_tested(page: HtmlPage) -> None:
+    def add_tested(page: Page) -> None:
         page.heading("What was tested")
         page.text(
             f"{len(result.figures)} kinds of runs on {len(saved.evidence.surrogates)} models that were learned from "

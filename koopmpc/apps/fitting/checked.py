@@ -73,55 +73,23 @@ class Figures:
 
 @dataclass(frozen=True)
 class Checked:
-    """The verdict, with the figures of each kind of run; `print` shows it.
+    """The verdict, with the figures of each kind of run; `print` shows it."""
 
-    Attributes
-    ----------
-    kept
-        Whether the goal is kept, and known to be: the verdict is "kept".
-    reasons
-        Sentences that say why it is not kept.
-    doubts
-        Sentences that say where nobody can say whether it is kept, for there are no data.
-    remarks
-        Sentences on runs that end off the reference with other noise or inputs than in the data; they do not count.
-    rate
-        Exact bound on the share of fresh independent loops that break a limit or are lost.
-    wished
-        The bound that the number of fresh loops was chosen for.
-    plant
-        The same of logged runs on the plant, where they were given.
-    broken
-        Sentences that say what happened in runs with faults; among the reasons too, where these were asked to count.
-    figures
-        What was measured in each kind of run.
-    cold, hot
-        Time of the first step of a fresh controller, and the 99 % quantile of all others [s].
-    dt
-        Sampling time [s].
-    cost_steps
-        A cost is the sum over so many steps, the first of a run.
-    page
-        Path of the report.
-    compared
-        What new logs say, where they are given.
-    """
-
-    kept: bool
-    reasons: tuple[str, ...]
-    broken: tuple[str, ...]
-    figures: tuple[Figures, ...]
-    cold: float
-    hot: float
-    dt: float
-    page: Path
-    doubts: tuple[str, ...] = ()
-    compared: ComparedLogs | None = None
-    rate: LoopRate | None = None
-    plant: LoopRate | None = None
-    remarks: tuple[str, ...] = ()
-    cost_steps: int = 0
-    wished: float = 0.05
+    kept: bool  # the goal is kept, and known to be
+    reasons: tuple[str, ...]  # why it is not kept
+    broken: tuple[str, ...]  # what happened in runs with faults; among the reasons too, where these are asked to count
+    figures: tuple[Figures, ...]  # what was measured in each kind of run
+    cold: float  # time of the first step of a fresh controller [s]
+    hot: float  # 99 % quantile of the times of all others [s]
+    dt: float  # sampling time [s]
+    page: Path  # the report
+    doubts: tuple[str, ...] = ()  # where nobody can say whether it is kept, for there are no data
+    compared: ComparedLogs | None = None  # what new logs say, where they are given
+    rate: LoopRate | None = None  # exact bound on the share of fresh loops that break a limit or are lost
+    plant: LoopRate | None = None  # the same of logged runs on the plant, where they are given
+    remarks: tuple[str, ...] = ()  # which runs end off the reference with other noise or inputs; they do not count
+    cost_steps: int = 0  # a cost is the sum over so many steps, the first of a run
+    wished: float = 0.05  # the bound that the number of fresh loops was chosen for
 
     @property
     def verdict(self) -> str:

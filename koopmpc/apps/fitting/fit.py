@@ -3,15 +3,13 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from koopmpc.apps.fitting.logs import IN_MEMORY, PAST, Data, DividedData, collect_notes, read_logs
+from koopmpc.apps.fitting.logs import PAST, Data, DividedData, collect_notes, read_logs
 from koopmpc.apps.fitting.options import FitOptions
-from koopmpc.base import checks
 from koopmpc.base.errors import FullDiskError
 from koopmpc.base.page import Page
 from koopmpc.base.parallel import StageProgress
@@ -33,88 +31,30 @@ from koopmpc.views.figures.style import save
 from koopmpc.views.recording.model import record_model
 
 Say = Callable[[str], None]
-_ROLLOUTS = 3  # draw forecasts of this many held-out episodes
 LINEAR = "linear.npz"  # beside a bilinear model.npz
 
 
 @dataclass(frozen=True, eq=False)
 class FittedData:
-    """The model that was chosen, its report, and the files that were written.
+    """The files that a fit wrote."""
 
-    Attributes
-    ----------
-    selection
-        The chosen model, and the leaderboard.
-    report
-        The trust report, on episodes that the model was not fitted to. Of records the chosen model, fitted without the
-        last fifth, is judged there; the model of the file is fitted to all rows.
-    plain
-        Errors of x⁺ = A x + B u + c on the same episodes.
-    held_out
-        The held-out episodes.
-    model, recording
-        Paths of the model file, and of the Rerun log, None where it could not be written.
-    page
-        Path of the report, in Markdown.
-    usage
-        Lines of Python that load the model; where it is bilinear also the best linear one.
-    failures
-        Pictures, or the log, that could not be made, and why.
-    """
-
-    selection: Selection
-    report: TrustReport
-    plain: Score
-    held_out: Episodes
     model: Path
-    recording: Path | None
-    page: Path
-    usage: str
-    failures: tuple[str, ...]
+    recording: Path | None  # the Rerun log, None where it could not be written
+    page: Path  # the report, in Markdown
+    usage: str  # lines of Python that load the model; where it is bilinear also the best linear one
+    failures: tuple[str, ...]  # pictures, or the log, that could not be made, and why
 
 
-def fit_data(
-    data: Data,
-    folder: str | PathLike[str],
-    options: FitOptions | None = None,
-    *,
-    memory: int = IN_MEMORY,
-    say: Say | None = None,
-    progress: StageProgress | None = None,
-    rng: np.random.Generator | int = 0,
-) -> FittedData:
+def fit_data(data: Data, folder: Path, asked: FitOptions, say: Say, progress: StageProgress | None) -> FittedData:
     """Read data, hold some out, choose and fit a model, judge it, and write model.npz, report.md and model.rrd.
 
-    Parameters
-    ----------
-    data
-        A folder of .npz, .parquet, .csv and .rrd files, or files. Of a folder of runs only the .rrd logs are read.
-    folder
-        Where everything is written; it is made if need be.
-    options
-        How the logs are read, and which models are tried, see `FitOptions`. If a bilinear model is chosen, the best
-        linear one goes to linear.npz.
-    memory
-        Bytes of files up to which they are read as a whole; beyond, the fit reads them part by part.
-    say
-        Called with each paragraph of text as it is known.
-    progress
-        As in `select`.
-    rng
-        Draws the held-out episodes, and all that `select` draws.
-
-    Raises
-    ------
-    LogError
-        A file cannot be read, or the folder not written.
-    DataError
-        The data are not of one plant, or too few.
+    Of a folder of runs only the .rrd logs are read. If a bilinear model is chosen, the best linear one goes to
+    linear.npz. `say` is called with each paragraph of text as it is known, `progress` as in `select`.
     """
-    place, draw = Path(folder), checks.generator(rng)
-    asked, tell = options or FitOptions(), ignore_text if say is None else say
-    split = read_logs(data, asked.horizon, draw, memory, asked.list_reading())
+    draw = np.random.default_rng(0)
+    split = read_logs(data, asked.horizon, draw, asked.list_reading())
     about = describe_data(split)
-    tell(about)
+    say(about)
     doubts: list[str] = []
     record = split.learned is not None  # select searches longer pasts of it by itself
     with collect_notes(doubts):
@@ -131,21 +71,21 @@ def fit_data(
                 rng=draw,
             ),
         )
-    model = place / "model.npz"
+    model = folder / "model.npz"
     selection.predictor.save(model)
     if selection.linear is not None and selection.linear is not selection.predictor:
-        selection.linear.save(place / LINEAR)
+        selection.linear.save(folder / LINEAR)
     chosen = "\n".join([str(selection), *(f"! {doubt}" for doubt in doubts)])
-    tell(chosen)
+    say(chosen)
     with collect_notes([]):  # the fits repeat the doubts that stand above
         judged = selection.predictor if split.learned is None else fit_again(selection, split.learned)
         seen, held_out = (judged.align(data) for data in (split.seen, split.held_out))
         report = trust(judged, held_out, split.ahead, train=seen, rng=draw)
         plain = score(edmd(seen, State() + Constant()), held_out, split.ahead)
     verdict = f"{report}\n\n{_compare_with_plain(report.score, plain)}"
-    tell(verdict)
+    say(verdict)
     failures: list[str] = []
-    recording = place / "model.rrd"
+    recording = folder / "model.rrd"
     try:
         record_model(judged, held_out, recording, report=report)
     except FullDiskError:
@@ -153,12 +93,8 @@ def fit_data(
     except Exception as failure:  # a log that cannot be written must not cost the model
         failures.append(f"{recording.name}: {type(failure).__name__}: {failure}")
     usage, pictures = _format_usage(selection, model), list_pictures(selection, judged, report, plain, held_out)
-    page = _write_page(Page(place), (verdict, usage, about, chosen), pictures, failures)
+    page = _write_page(Page(folder), (verdict, usage, about, chosen), pictures, failures)
     return FittedData(
-        selection=selection,
-        report=report,
-        plain=plain,
-        held_out=held_out,
         model=model,
         recording=recording if recording.exists() else None,
         page=page,
@@ -214,18 +150,8 @@ def list_pictures(
 ) -> Iterator[tuple[str, str, Callable[[], Any]]]:
     """Yield the name of each picture, its caption, and the call that draws it.
 
-    Parameters
-    ----------
-    selection
-        The chosen model.
-    judged
-        The same model as it was judged: of records fitted without their held-out ends.
-    report
-        Its trust report: errors, bands and residuals.
-    plain
-        Errors of x⁺ = A x + B u + c, which the model has to beat.
-    held_out
-        Episodes that no fit saw; the first three are forecast.
+    `judged` is the chosen model as it was judged: of records fitted without their held-out ends. `plain` are the errors
+    of x⁺ = A x + B u + c. The first three held-out episodes are forecast.
     """
     horizon = report.score.horizon
     finite = bool(np.isfinite(report.band.width).all())
@@ -240,7 +166,7 @@ def list_pictures(
         return error(named, width="two columns")
 
     yield "error", "Errors on held-out episodes against the steps ahead, beside those of x⁺ = A x + B u + c.", errors
-    for i, episode in enumerate(list(held_out)[:_ROLLOUTS]):
+    for i, episode in enumerate(list(held_out)[:3]):
         caption = f"Forecast of held-out episode {i} from its start, and the {around}."
         yield f"rollout-{i}", caption, partial(rollout, judged, episode, horizon, bands, relift=report.band.relift)
     caption = "Eigenvalues of A and the unit circle; crosses are spurious on the held-out episodes."
@@ -275,7 +201,3 @@ def _compare_with_plain(score: Score, plain: Score) -> str:
         shares = score.rmse[-1] / plain.rmse[-1]
     named = ", ".join(f"{name} {share:.2g}" for name, share in zip(score.states, shares, strict=True))
     return f"RMSE {score.horizon} steps ahead over that of the plain linear fit x⁺ = A x + B u + c:\n  {named}"
-
-
-def ignore_text(_: str) -> None:
-    """Say nothing."""

@@ -12,8 +12,8 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.apps.fitting.fit import Say, describe_data, ignore_text
-from koopmpc.apps.fitting.logs import IN_MEMORY, Data, read_logs
+from koopmpc.apps.fitting.fit import Say, describe_data
+from koopmpc.apps.fitting.logs import Data, read_logs
 from koopmpc.apps.fitting.options import FitOptions
 from koopmpc.base import checks, disk
 from koopmpc.base.errors import DataError, LogError
@@ -35,57 +35,30 @@ _INPUT = {"weight", "limits", "change", "change_weight"}
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """The task of a controller that is to be designed.
-
-    Attributes
-    ----------
-    cost, limits, horizon
-        What the controller gets.
-    reference
-        (nr,) or rows (T+1, nr) of the states that the cost weighs.
-    angles
-        Indices of states whose errors wrap.
-    margin
-        Share of loops on stand-ins that are to keep their limits; None asks for no promise.
-    certify
-        Whether a certificate of stability is sought at the reference.
-    """
+    """The task of a controller that is to be designed."""
 
     cost: Cost
     limits: Limits
     horizon: int
-    reference: Float[np.ndarray, "..."]
-    angles: tuple[int, ...]
-    margin: float | None = None
-    certify: bool = False
+    reference: Float[np.ndarray, "..."]  # (nr,) or rows (T+1, nr) of the states that the cost weighs
+    angles: tuple[int, ...]  # indices of states whose errors wrap
+    margin: float | None = None  # share of loops on stand-ins that are to keep their limits; None: no promise
+    certify: bool = False  # a certificate of stability is sought at the reference
 
 
 _EVENED = "  # nobody asked for it: steps of the logs are unequal; states are interpolated to so many s, inputs held"
 
 
-def write_template(
-    data: Data, options: FitOptions | None = None, *, memory: int = IN_MEMORY, say: Say | None = None
-) -> str:
+def write_template(data: Data, wished: FitOptions, say: Say) -> str:
     """Return the text of a goal file for the plant of some logs, with the ranges found and how the logs are read.
 
-    Parameters
-    ----------
-    data, options, memory
-        As for `fit_data`. Without a horizon it follows from the lengths of the episodes.
-    say
-        Called with what was understood of the logs: which columns are states and inputs, and what is wrong with them.
-
-    Raises
-    ------
-    DataError
-        No column is an input.
+    `say` is called with what was understood of the logs: which columns are states and inputs, and what is wrong.
     """
-    wished = options or FitOptions()
-    split = read_logs(data, wished.horizon, checks.generator(0), memory, wished.list_reading(), SHORT)
+    split = read_logs(data, wished.horizon, checks.generator(0), wished.list_reading(), SHORT)
     if not split.seen.nu:
         advice = "the logs have no input, so nothing can be controlled; pass --inputs u,v"
         raise DataError("\n".join([advice, *split.notes]))
-    (ignore_text if say is None else say)(describe_data(split))
+    say(describe_data(split))
     both = split.seen.with_episodes([*split.seen, *split.held_out])
     evened = "resample" in split.reading and "resample" not in wished.list_reading()
     return format_template(both, horizon=wished.horizon, reading=split.reading, evened=evened)
@@ -156,13 +129,7 @@ def list_goal_inputs(path: str | PathLike[str]) -> tuple[str, ...]:
 
 
 def load_reading(path: str | PathLike[str]) -> dict[str, Any]:
-    """Return the keywords of `load_episodes` in the section [logs] of a goal file; none where it has no such section.
-
-    Raises
-    ------
-    DataError
-        It is no section, or has a key that is no such keyword.
-    """
+    """Return the keywords of `load_episodes` in the section [logs] of a goal file; none without such a section."""
     file = Path(path)
     given = load_toml(file).get("logs", {})
     if not isinstance(given, dict):
@@ -173,13 +140,7 @@ def load_reading(path: str | PathLike[str]) -> dict[str, Any]:
 
 
 def load_toml(file: Path) -> dict[str, Any]:
-    """Return the content of a TOML file.
-
-    Raises
-    ------
-    LogError
-        The file is missing or no TOML.
-    """
+    """Return the content of a TOML file; a LogError where it is missing or no TOML."""
     disk.existing(file, "koopmpc fit LOGS --goal-template writes one")
     try:
         return tomllib.loads(file.read_text())
@@ -214,11 +175,7 @@ def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
     tracked = [i for i in range(data.nx) if Q[i] > 0]
     if not tracked:
         raise DataError(f"{file} gives no state a weight above 0, so nothing is asked; set one")
-    lengths = {len(np.atleast_1d(rows[i])) for i in tracked} - {1}
-    if len(lengths) > 1:
-        raise DataError(f"{file} has references of {sorted(lengths)} values; write lists of one length, or numbers")
-    steps = lengths.pop() if lengths else 1
-    reference = np.column_stack([np.broadcast_to(rows[i], steps) for i in tracked])
+    reference = _stack_references([rows[i] for i in tracked], file)
     horizon, certify = tree.get("horizon", usual_horizon(data)[0]), tree.get("certify", False)
     if not isinstance(horizon, int) or isinstance(horizon, bool) or horizon < 1:
         raise DataError(
@@ -235,11 +192,18 @@ def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
         cost=Cost(Q=Q[tracked], R=R, R_delta=R_delta if R_delta.any() else None, of=of),
         limits=Limits(u_min=u_low, u_max=u_high, x_min=x_low, x_max=x_high, du_max=limited),
         horizon=horizon,
-        reference=reference[0] if steps == 1 else reference,
+        reference=reference[0] if len(reference) == 1 else reference,
         angles=tuple(angles),
         margin=margin or None,
         certify=bool(certify),
     )
+
+
+def _stack_references(rows: Sequence[Float[np.ndarray, "..."]], file: Path) -> Float[np.ndarray, "T nr"]:
+    lengths = {len(np.atleast_1d(row)) for row in rows} - {1}
+    if len(lengths) > 1:
+        raise DataError(f"{file} has references of {sorted(lengths)} values; write lists of one length, or numbers")
+    return np.column_stack([np.broadcast_to(row, max(lengths, default=1)) for row in rows])
 
 
 SignalColumn = Float[np.ndarray, " n"]
@@ -284,13 +248,7 @@ def _read_inputs(
 def _find_sections(
     tree: Mapping[str, Any], what: str, names: tuple[str, ...], keys: set[str], file: Path
 ) -> list[Mapping[str, Any]]:
-    """Return the section of each name, empty where there is none.
-
-    Raises
-    ------
-    DataError
-        A section names no column of the data, or another unit than the column has.
-    """
+    """Return the section of each name, empty where there is none; refuse names and units that the data do not have."""
     given = tree.get(what, {})
     if not isinstance(given, dict):
         raise DataError(f'{file}: {what} is {given!r}; write a section for each, such as [{what}."{names[0]}"]')

@@ -33,30 +33,28 @@ def read_logs(
     data: Data,
     horizon: int | None,
     rng: np.random.Generator,
-    memory: int,
-    options: Mapping[str, Any],
+    reading: Mapping[str, Any],
     short: str = _SHORTER,
     *,
     ask: bool = True,
 ) -> "DividedData":
     """Return the data of logs as `divide_files` makes them; the notes begin with how the logs were read.
 
-    `options` holds keywords of `load_episodes`; None counts as not given. Unequal steps are interpolated
-    to their median, or a number of two digits near it, unless ``resample`` is given, and a note says so.
+    `reading` holds keywords of `load_episodes`. Unequal steps are interpolated to their median, or a number of two
+    digits near it, unless ``resample`` is given, and a note says so.
 
     Raises
     ------
     DataError
         As `divide_files`; with `ask` also where no column has the name of an input and the caller names none.
     """
-    reading = {name: value for name, value in options.items() if value is not None}
-    logs, notes = find_logs(data), list[str]()
+    reading, logs, notes = dict(reading), find_logs(data), list[str]()
     with collect_notes(notes):
         if ask:
             warnings.simplefilter("error", NoInputWarning)
         try:
             files = Files(logs, **reading)
-            split = divide_files(files, horizon, rng, memory, short)
+            split = divide_files(files, horizon, rng, short)
         except NoInputWarning as missing:
             raise DataError(missing.question) from missing
         except UnevenSamplingError as uneven:
@@ -64,18 +62,15 @@ def read_logs(
                 raise
             reading["resample"] = round_step(uneven.dt)
             files = Files(logs, **reading)
-            split = divide_files(files, horizon, rng, memory, short)
+            split = divide_files(files, horizon, rng, short)
     how = [*shorten_notes(notes, files.files), *describe_guesses(files.files, reading)]
     return replace(split, notes=(*how, *split.notes), reading=reading)
 
 
-_NEAR = 0.005  # a median step this close to a number of two digits is taken for it: recorders have such steps
-
-
-def round_step(dt: float) -> float:
-    """Return the sample time of two digits that a median step [s] stands for, or the median where none is near."""
+def round_step(dt: float, *, near: float = 0.005) -> float:
+    """Return the sample time of two digits that is within the share `near` of a median step [s], or else the median."""
     plain = float(f"{dt:.2g}")
-    return plain if abs(dt - plain) <= _NEAR * plain else dt
+    return plain if abs(dt - plain) <= near * plain else dt
 
 
 def find_logs(data: Data) -> Data:
@@ -94,9 +89,6 @@ def describe_guesses(files: Iterable[str | PathLike[str]], reading: Mapping[str,
         if stream.readline().startswith(",".join(SAVED).encode()):  # episodes that were saved, with their roles
             return []
     return ["which columns are inputs was guessed from their names; --inputs u,v and --states a,b say it"]
-
-
-_SHOWN = 6  # a report shows the notes of this many files
 
 
 @contextmanager
@@ -120,7 +112,7 @@ def collect_notes(notes: list[str]) -> Generator[None]:
         notes.insert(0, name_resampled(list(resampled.values())))
 
 
-def shorten_notes(notes: Iterable[str], files: Iterable[Path]) -> list[str]:
+def shorten_notes(notes: Iterable[str], files: Iterable[Path], *, shown: int = 6) -> list[str]:
     """Return the notes: one line for a note that files share, and the first few of those that only one file has."""
     known = [str(file) for file in files]
     of: dict[str, list[str]] = {}
@@ -130,22 +122,18 @@ def shorten_notes(notes: Iterable[str], files: Iterable[Path]) -> list[str]:
             of.setdefault(text, []).append(file)
         else:
             of[note] = []
-    short: list[str] = []
-    alone = 0
-    for text, where in of.items():
-        if len(where) > 1:
-            short.append(f"{name_files(where, known)}: {text}")
-        elif where and alone < _SHOWN:
-            short.append(f"{where[0]}: {text}")
-        elif not where:
-            short.append(text)
-        alone += len(where) == 1
-    if alone > _SHOWN:
-        short.append(f"{alone - _SHOWN} more files have notes of their own; load_episodes shows them")
+    alone = [text for text, where in of.items() if len(where) == 1]
+    short = [
+        f"{name_files(where, known) if len(where) > 1 else where[0]}: {text}" if where else text
+        for text, where in of.items()
+        if text not in alone[shown:]
+    ]
+    if len(alone) > shown:
+        short.append(f"{len(alone) - shown} more files have notes of their own; load_episodes shows them")
     return short
 
 
-IN_MEMORY = 150_000_000  # files up to this size [bytes] are read as a whole
+IN_MEMORY = 150_000_000  # files up to this size [bytes] are read as a whole; beyond, the fit reads them part by part
 PAST = 2  # models look back at most this many steps
 _SHARE = 0.2  # hold out this share of the episodes
 _FEWEST = 4  # blocks of a held-out end that are too few for a band
@@ -155,45 +143,19 @@ _JUDGED = 10_000  # a report is made of at most about this many steps
 
 @dataclass(frozen=True, eq=False)
 class DividedData:
-    """The data that a model is fitted to, and the held-out episodes that judge it.
+    """The data that a model is fitted to, and the held-out episodes that judge it."""
 
-    Attributes
-    ----------
-    fitted
-        A source, larger than memory if need be.
-    seen
-        Some of the fitted episodes, which stand for the training data in the report.
-    held_out
-        Episodes that the judged model's fit does not see.
-    horizon
-        Steps ahead.
-    size
-        The amount of data, in words.
-    notes
-        How the logs were read and what was done to the data, in sentences.
-    delay
-        Steps of the past that a model needs for signals that are late.
-    reading
-        Keywords of `load_episodes` that read the same data again.
-    learned
-        Records without their held-out ends, where `fitted` holds all rows: the model to judge is fitted to them.
-    excerpt
-        Rows of the logs as they were read, for pictures, with marks where they were repaired.
-    verdict
-        Steps ahead of the verdict, where they are others than those of the choice.
-    """
-
-    fitted: Source | Episodes
-    seen: Episodes
-    held_out: Episodes
-    horizon: int
-    size: str
-    notes: tuple[str, ...]
-    delay: int
-    reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    learned: Episodes | None = None
-    excerpt: LogExcerpt | None = None
-    verdict: int | None = None
+    fitted: Source | Episodes  # a source may be larger than memory
+    seen: Episodes  # some of the fitted episodes, which stand for the training data in the report
+    held_out: Episodes  # the fit of the judged model does not see them
+    horizon: int  # steps ahead
+    size: str  # the amount of data, in words
+    notes: tuple[str, ...]  # how the logs were read and what was done to the data, in sentences
+    delay: int  # steps of the past that a model needs for signals that are late
+    reading: Mapping[str, Any] = field(default_factory=dict[str, Any])  # keywords that read the same data again
+    learned: Episodes | None = None  # records without their held-out ends, to which the model to judge is fitted
+    excerpt: LogExcerpt | None = None  # rows as they were read, for pictures, with marks where they were repaired
+    verdict: int | None = None  # steps ahead of the verdict, where they are others than those of the choice
 
     @property
     def ahead(self) -> int:
@@ -201,26 +163,15 @@ class DividedData:
         return self.horizon if self.verdict is None else self.verdict
 
 
-def divide_files(
-    files: Files,
-    horizon: int | None,
-    rng: np.random.Generator,
-    memory: int,
-    short: str = _SHORTER,
-) -> DividedData:
-    """Hold out a fifth of the episodes, or of blocks of a few long ones; beyond `memory` a tenth of the parts.
+def divide_files(files: Files, horizon: int | None, rng: np.random.Generator, short: str = _SHORTER) -> DividedData:
+    """Hold out a fifth of the episodes, or of blocks of a few long ones; of files beyond memory a tenth of the parts.
 
-    `short` is what to do where too few episodes are as long as the horizon.
-
-    Raises
-    ------
-    DataError
-        Too few episodes are as long as the horizon.
+    `short` is the advice where too few episodes are as long as the horizon.
     """
     parts = files.parts()
     size = sum(file.stat().st_size for file in files.files)
     amount = f"{len(files.files)} file{'s' * (len(files.files) > 1)}, {_format_bytes(size)}"
-    if size <= memory or len(parts) < 2:
+    if size <= IN_MEMORY or len(parts) < 2:
         logs = join_sets([part.load() for part in parts])
         episodes, faults, delay, origins, doubtful = audit_episodes(logs)
         repair = find_repairs(episodes)
@@ -247,7 +198,7 @@ def divide_files(
         raise DataError(_say_too_short(len(judged), ahead + past, short))
     seen, _ = take_sample(rest, _JUDGED)
     note = (
-        f"larger than {_format_bytes(memory)}, so read in {len(parts)} parts: {len(out)} of them "
+        f"larger than {_format_bytes(IN_MEMORY)}, so read in {len(parts)} parts: {len(out)} of them "
         f"{'is' if len(out) == 1 else 'are'} held out, and the fit reads the others one by one"
     )
     return DividedData(

@@ -36,27 +36,13 @@ _LEAST = 0.5  # rows at fault are left out if at least this share of the steps r
 
 
 class Audited(NamedTuple):
-    """Episodes after the audit.
+    """Episodes after the audit."""
 
-    Attributes
-    ----------
-    rest
-        The episodes without the rows that `decide_places` leaves out.
-    notes
-        The faults, with what was done about each, in sentences.
-    delay
-        Steps of the past that a model needs for signals that are late.
-    origins
-        Place of each of these episodes in the logs.
-    doubtful
-        Places that are suspected, and were kept.
-    """
-
-    rest: Episodes
-    notes: tuple[str, ...]
-    delay: int
-    origins: tuple[Place, ...]
-    doubtful: tuple[Place, ...]
+    rest: Episodes  # without the rows that `decide_places` leaves out
+    notes: tuple[str, ...]  # the faults, with what was done about each, in sentences
+    delay: int  # steps of the past that a model needs for signals that are late
+    origins: tuple[Place, ...]  # place of each of these episodes in the logs
+    doubtful: tuple[Place, ...]  # places that are suspected, and were kept
 
 
 def audit_episodes(episodes: Episodes, *, cut: bool = True) -> Audited:
@@ -65,37 +51,40 @@ def audit_episodes(episodes: Episodes, *, cut: bool = True) -> Audited:
     With `cut` False the episodes are only a sample of the data, so that nothing can be left out.
     """
     report = audit(_drop_repeats(episodes))
-    rest, kinds, mended, out = episodes, set[str](), set[str](), set[str]()
-    whole = Remainder.of(episodes)
-    origins = whole.origins
-    if cut and any(fault.places for fault in report.faults):
+    left, kinds, mended, out = Remainder.of(episodes), set[str](), set[str](), set[str]()
+    if cut:
         kinds = decide_places(episodes, report.faults)
-        rest, mended = bridge_spikes(episodes, report.faults)
-        bad = tuple(fault for fault in report.faults if fault.name in kinds - mended)
-        left = Remainder.of(rest).without([place for fault in bad for place in fault.places]) if bad else None
-        if left is not None and sum(map(len, left.data)) >= _LEAST * sum(map(len, episodes)):
-            rest, origins, out = left.data, left.origins, kinds - mended
-    notes: list[str] = []
-    for fault in report.faults:
-        if fault.repair is Repair.COLUMN:  # `find_repairs` says what it does
-            continue
-        if fault.name in mended:
-            done = "these readings were replaced by the line between their neighbours"
-        elif fault.places and fault.name in out:
-            done = "these rows were left out"
-        elif fault.places and cut and fault.name not in kinds:
-            done = "these rows were kept: models without them forecast the other rows no better"
-        elif fault.steps:
-            done = f"models that see {fault.steps} steps of the past are tried: embedding=km.Delay({fault.steps})"
-        else:
-            done = fault.do
-        notes.append(f"{fault.name}: {_locate_fault(fault, episodes)}; {done}")
+        bridged, mended = bridge_spikes(episodes, report.faults)
+        left = Remainder.of(bridged)
+        bad = [place for fault in report.faults if fault.name in kinds - mended for place in fault.places]
+        sound = left.without(bad) if bad else None
+        if sound is not None and sum(map(len, sound.data)) >= _LEAST * sum(map(len, episodes)):
+            left, out = sound, kinds - mended
+    undecided = kinds if cut else {fault.name for fault in report.faults}
+    notes = [
+        f"{fault.name}: {_locate_fault(fault, episodes)}; {_say_repair(fault, mended, out, undecided)}"
+        for fault in report.faults
+        if fault.repair is not Repair.COLUMN  # `find_repairs` says what it does
+    ]
     notes += [f"input timing: {doubt}" for doubt in report.doubts]
     if report.memory is not None and report.memory.shows_hidden_state:
         notes.append(f"hidden state: {report.memory}; models with delays are tried")
     kept = [fault for fault in report.faults if fault.name not in out | mended]
     doubtful = tuple(place for fault in kept for place in fault.places)
-    return Audited(rest, tuple(notes), report.delay, origins, doubtful)
+    return Audited(left.data, tuple(notes), report.delay, left.origins, doubtful)
+
+
+def _say_repair(fault: LogFault, mended: set[str], out: set[str], undecided: set[str]) -> str:
+    """Return what is done about a fault whose kind was mended, left out, or should have been left out."""
+    if fault.name in mended:
+        return "these readings were replaced by the line between their neighbours"
+    if fault.places and fault.name in out:
+        return "these rows were left out"
+    if fault.places and fault.name not in undecided:
+        return "these rows were kept: models without them forecast the other rows no better"
+    if fault.steps:
+        return f"models that see {fault.steps} steps of the past are tried: embedding=km.Delay({fault.steps})"
+    return fault.do
 
 
 def _drop_repeats(episodes: Episodes) -> Episodes:
@@ -139,23 +128,13 @@ def _locate(place: Place, columns: tuple[str, ...], episodes: Episodes) -> str:
 
 @dataclass(frozen=True)
 class ColumnRepair:
-    """What is done to episodes before a fit: some columns are left out, and angles are unwrapped; `notes` say it all.
+    """What is done to episodes before a fit: some columns are left out, and angles are unwrapped."""
 
-    Attributes
-    ----------
-    states, inputs, disturbances
-        Indices of the columns that are kept.
-    unwrapped
-        Indices of the states, before any was left out, that are unwrapped along each episode.
-    notes
-        What was found, in sentences.
-    """
-
-    states: tuple[int, ...]
+    states: tuple[int, ...]  # indices of the columns that are kept
     inputs: tuple[int, ...]
     disturbances: tuple[int, ...]
-    unwrapped: tuple[int, ...]
-    notes: tuple[str, ...]
+    unwrapped: tuple[int, ...]  # indices of the states, before any was left out, that are unwrapped along each episode
+    notes: tuple[str, ...]  # what was found, in sentences
 
     def __call__(self, episodes: Episodes) -> Episodes:
         """Return the repaired episodes, or the episodes themselves where there is nothing to repair."""
@@ -183,13 +162,7 @@ class ColumnRepair:
 
 
 def find_repairs(episodes: Episodes) -> ColumnRepair:
-    """Return the repairs that these episodes need.
-
-    Raises
-    ------
-    DataError
-        No state moves, or no input.
-    """
+    """Return the repairs that these episodes need; a DataError where no state moves, or no input."""
     notes: list[str] = []
     X = np.concatenate([e.X for e in episodes])
     driven = np.concatenate([np.hstack([e.U, e.W]) for e in episodes])
@@ -245,13 +218,6 @@ def decide_places(episodes: Episodes, faults: Sequence[LogFault]) -> set[str]:
     many episodes. In a record, a sensor at rest, at its limit, coarse or slow shows equal rows that may be sound. They
     go only if a model that does not learn from them has the smaller median error of forecasts over unseen rows that no
     check suspects: 5 % smaller over all stretches, and smaller on three stretches of four.
-
-    Parameters
-    ----------
-    episodes
-        The logs.
-    faults
-        What the audit found.
     """
     chosen = {fault.name for fault in faults if fault.places}
     if not is_record(episodes):
@@ -293,16 +259,7 @@ def gains_without(
 ) -> bool:
     """Return whether models that do not learn from `places` forecast rows better that are in no `suspected` place.
 
-    Parameters
-    ----------
-    episodes
-        The logs.
-    places
-        Rows that may be left out.
-    suspected
-        All rows at fault, which judge nothing.
-    wild
-        Rows that no model learns from.
+    Rows at fault, `suspected`, judge nothing, and no model learns from those that are `wild`.
     """
     ratios: list[float] = []
     with hide_fit_warnings():

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.base.page import HtmlPage
+from koopmpc.base.page import Page
 from koopmpc.base.text import shorten_observable, to_percent, with_unit
 from koopmpc.control.ask.limits import Interval
 from koopmpc.lifting.base import strip_unit
@@ -34,7 +34,7 @@ _ALIKE = 4  # more observables of one kind are counted
 _NAMED = 16  # observables that are named
 _NONE = "–"
 
-Section = Callable[[HtmlPage], None]
+Section = Callable[[Page], None]
 
 
 def write_design_report(
@@ -48,29 +48,12 @@ def write_design_report(
 ) -> Path:
     """Write the report of a design and return its path.
 
-    Parameters
-    ----------
-    saved
-        The design and its evidence.
-    controller
-        The controller, which runs the loops that are drawn; it is reset before and after.
-    path
-        The file to write.
-    file
-        Path of the controller's file, for the commands that run it.
-    verdict
-        Adds the verdict of a check below the title; without it the promise of the design stands there.
-    tested
-        Adds the runs of a check.
-
-    Raises
-    ------
-    LogError
-        The file cannot be written.
+    The controller, whose `file` the commands name, runs the loops that are drawn; it is reset before and after.
+    `verdict` adds that of a check below the title, in place of the promise of the design, and `tested` its runs.
     """
     evidence, logs = saved.evidence, saved.logs
     of = evidence.task.cost.of.bind(controller_states(evidence))
-    page = HtmlPage(f"Controller report: {', '.join(strip_unit(name) for name in of.names)}")
+    page = Page(path.parent, title=f"Controller report: {', '.join(strip_unit(name) for name in of.names)}")
     if verdict is None:
         page.verdict("good" if not evidence.expected.lost else "doubt", *_list_promise(evidence)[:2])
     else:
@@ -109,7 +92,7 @@ def write_design_report(
         page.code(logs.choice)
         page.heading("The goal file")
         page.code(logs.goal)
-    return page.write(path)
+    return page.write(path.name)
 
 
 def controller_states(evidence: Evidence) -> tuple[str, ...]:
@@ -125,7 +108,7 @@ def _format_range(low: float, high: float, unit: str = "") -> str:
     return f"{low:.4g} to {high:.4g}"
 
 
-def _add_goal(page: HtmlPage, evidence: Evidence, controller: AnyMPC) -> None:
+def _add_goal(page: Page, evidence: Evidence, controller: AnyMPC) -> None:
     asked, states, inputs = evidence.task, controller_states(evidence), evidence.surrogates[0].model.inputs
     of = asked.cost.of.bind(states)
     Q, R = asked.cost.matrices(of.nz, len(inputs))
@@ -166,7 +149,7 @@ def _add_goal(page: HtmlPage, evidence: Evidence, controller: AnyMPC) -> None:
         )
 
 
-def _add_logs(page: HtmlPage, logs: LogSummary | None) -> None:
+def _add_logs(page: Page, logs: LogSummary | None) -> None:
     if logs is None:
         page.text("The controller was designed in Python from episodes in memory; its file keeps no rows of them.")
         return
@@ -197,7 +180,7 @@ def _draw(figures: Iterable[tuple[str, Callable[[], Any]]]) -> list[tuple[str, s
     return [(render_svg(draw()), caption) for caption, draw in figures]
 
 
-def _add_model(page: HtmlPage, saved: SavedDesign) -> None:
+def _add_model(page: Page, saved: SavedDesign) -> None:
     one, logs = saved.controller, saved.logs
     model = one.model
     assert model is not None, "every design has a model"
@@ -224,7 +207,7 @@ def _list_observables(names: Sequence[str]) -> str:
     return ", ".join(said[:_NAMED]) + (f", and {more} more" if more > 0 else "")
 
 
-def _add_forecasts(page: HtmlPage, logs: LogSummary | None) -> None:
+def _add_forecasts(page: Page, logs: LogSummary | None) -> None:
     if logs is None or not logs.forecasts:
         page.text("No rows were held out." if logs is None else logs.verdict)
         return
@@ -254,15 +237,7 @@ def _add_forecasts(page: HtmlPage, logs: LogSummary | None) -> None:
 
 
 def run_shown_loops(evidence: Evidence, controller: AnyMPC) -> dict[str, list[Run | None]]:
-    """Return closed loops by what stands in for the plant; None for one that was lost.
-
-    Parameters
-    ----------
-    evidence
-        Task and stand-ins of the plant.
-    controller
-        Is reset before each loop and at the end.
-    """
+    """Return closed loops by what stands in for the plant; None for one that was lost."""
     asked, starts = evidence.task, evidence.expected.starts
     starts = starts if len(starts) else asked.starts
     rows = read_reference(asked, 0, asked.steps + 1 + controller.horizon)
@@ -296,7 +271,7 @@ def run_shown_loops(evidence: Evidence, controller: AnyMPC) -> dict[str, list[Ru
     return made
 
 
-def _add_loops(page: HtmlPage, evidence: Evidence, controller: AnyMPC, loops: dict[str, list[Run | None]]) -> None:
+def _add_loops(page: Page, evidence: Evidence, controller: AnyMPC, loops: dict[str, list[Run | None]]) -> None:
     every = [run for runs in loops.values() for run in runs]
     ended = [run for run in every if run is not None]
     lost = len(every) - len(ended)
@@ -312,8 +287,7 @@ def _add_loops(page: HtmlPage, evidence: Evidence, controller: AnyMPC, loops: di
     states, inputs = controller_states(evidence), ended[0].inputs
     asked, tracked = evidence.task, evidence.task.cost.of.bind(states).names
     boxes: tuple[Interval, Interval] = asked.limits.states(len(states)), asked.limits.inputs(len(inputs))
-    groups = {name: [run for run in runs if run is not None] for name, runs in loops.items()}
-    groups = {name: runs for name, runs in groups.items() if runs}
+    groups = {name: there for name, runs in loops.items() if (there := [run for run in runs if run is not None])}
 
     def draw_state(i: int) -> Any:
         curves = {name: [(run.time, run.X[:, i]) for run in runs] for name, runs in groups.items()}
@@ -327,10 +301,9 @@ def _add_loops(page: HtmlPage, evidence: Evidence, controller: AnyMPC, loops: di
         return draw_loops(inputs[j], curves, _list_finite(boxes[1], j), steps=True)
 
     figures = [
-        (f"{strip_unit(states[i])}: closed loops", partial(draw_state, i)) for i in range(min(len(states), _SHOWN))
-    ]
-    figures += [
-        (f"{strip_unit(inputs[j])}: closed loops", partial(draw_input, j)) for j in range(min(len(inputs), _SHOWN))
+        (f"{strip_unit(name)}: closed loops", partial(draw, i))
+        for names, draw in ((states, draw_state), (inputs, draw_input))
+        for i, name in enumerate(names[:_SHOWN])
     ]
     page.pictures(_draw(figures))
 
@@ -339,7 +312,7 @@ def _list_finite(box: Interval, i: int) -> list[float]:
     return [float(end[i]) for end in box if np.isfinite(end[i])]
 
 
-def _add_blind(page: HtmlPage, evidence: Evidence, loops: dict[str, list[Run | None]]) -> None:
+def _add_blind(page: Page, evidence: Evidence, loops: dict[str, list[Run | None]]) -> None:
     fresh, near = evidence.expected.fresh, evidence.neighbours
     if fresh is not None and near is not None and near.embedding is None and len(fresh.outside):
         share = float(fresh.outside.mean())
@@ -397,7 +370,7 @@ def _say_violated(share: float) -> str:
     return f"limits are violated by at most {to_percent(share)} of their range" if share > 0 else "no limit is violated"
 
 
-def _add_usage(page: HtmlPage, file: str, controller: AnyMPC, evidence: Evidence) -> None:
+def _add_usage(page: Page, file: str, controller: AnyMPC, evidence: Evidence) -> None:
     row: Float[np.ndarray, " nr"] = evidence.task.reference[0]
     reference = ", ".join(f"{value:.6g}" for value in row)
     states = ", ".join(controller_states(evidence))

@@ -17,10 +17,6 @@ from koopmpc.synthesis.rates import KEPT, LoopRate
 from koopmpc.synthesis.search.recipe import get_model
 from koopmpc.validate.binomial import count_runs_needed
 
-SAME = 0.02  # a logged input is the controller's if it differs by at most this share of the input's range
-OWN = 0.9  # least share of logged inputs that are the controller's
-ROUND = 50  # loops between two reports of progress
-
 
 def plan_verdict(rate: float) -> str:
     """Return how many loops a bound of `rate` needs, in words."""
@@ -37,6 +33,8 @@ def judge_rate(
     rate: float,
     rng: np.random.Generator,
     report: Callable[[int, int], None] | None = None,
+    *,
+    abreast: int = 50,
 ) -> LoopRate:
     """Return the verdict of as many fresh loops as a bound of `rate` needs when none fails.
 
@@ -46,8 +44,8 @@ def judge_rate(
     pool = LoopPool(evidence.task, evidence.surrogates, evidence.neighbours, evidence.low, evidence.high)
     drawn, fast = pool.draw(count, rng), speed_up(controller)
     results: list[LoopResult] = []
-    for first in range(0, count, ROUND):
-        results += pool.run(fast, drawn[first : first + ROUND])
+    for first in range(0, count, abreast):
+        results += pool.run(fast, drawn[first : first + abreast])
         if report is not None:
             report(len(results), count)
     lost = sum(result.run is None for result in results)
@@ -56,15 +54,12 @@ def judge_rate(
     return LoopRate(count, broken, lost, on_rows=rows)
 
 
-def judge_plant_runs(evidence: Evidence, controller: Any, logs: Episodes) -> LoopRate:
+def judge_plant_runs(evidence: Evidence, controller: Any, logs: Episodes, *, same: float = 0.02) -> LoopRate:
     """Return the verdict of logged runs of this controller on its plant, in rows timed as those of the design's logs.
 
-    With feedthrough each row holds the reading h(x, u) of the input before, which the controller had.
-
-    Raises
-    ------
-    DataError
-        The logs have other states or inputs, or less than nine tenths of their inputs are this controller's.
+    With feedthrough each row holds the reading h(x, u) of the input before, which the controller had. An input is the
+    controller's if it differs by at most the share `same` of the input's range.
+    Logs with other states or inputs, or with less than nine tenths of this controller's inputs, are refused.
     """
     asked, nx, nu = evidence.task, len(evidence.task.low), controller.nu
     if logs.nx != nx or logs.nu != nu:
@@ -80,9 +75,9 @@ def judge_plant_runs(evidence: Evidence, controller: Any, logs: Episodes) -> Loo
         for k, u in enumerate(episode.U):
             rows = asked.reference[min(k, len(asked.reference) - 1) :][: controller.horizon + 1]
             move = controller(episode.X[k], rows, applied=last)
-            alike, steps, last = alike + bool((np.abs(move.u - u) <= SAME * size).all()), steps + 1, u
+            alike, steps, last = alike + bool((np.abs(move.u - u) <= same * size).all()), steps + 1, u
     own = alike / max(steps, 1)
-    if own < OWN:
+    if own < 0.9:
         timing = ", each row with the reading h(x, u) of the input before, which the controller had" * direct
         raise DataError(
             f"in the logged states this controller asks for {to_percent(own)} of the logged inputs: the "
