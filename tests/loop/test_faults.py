@@ -99,14 +99,6 @@ def ramp(faults, steps=8, limits=None, x0=(0.9, 0.0), **rest):
     return closed_loop(Ramp(), faults, steps=steps, limits=limits, x0=x0, **rest)
 
 
-def test_no_faults_leave_a_run_as_it_was(controllers):
-    for controller in controllers.values():
-        bare = km.simulate(PLANT, controller, x0=[0.9, 0.0], reference=[0.0, 0.0], steps=6, cost=COST, limits=LIMITS)
-        run = closed_loop(controller, (), steps=6)
-        assert "faults" not in run.metadata
-        assert replace(run, solve_time=bare.solve_time) == bare
-
-
 def test_faults_that_never_strike_change_only_the_metadata(controllers):
     never = (
         km.faults.NaNSensor(probability=0.0),
@@ -238,15 +230,6 @@ def test_what_a_shifted_plan_applies_is_the_plan_of_the_last_good_step(controlle
         )
         assert np.array_equal(run.U[:4], run.plans.U[0, :4]), name
         assert np.isnan(run.plans.U[1:4]).all()
-
-
-def test_a_solver_that_nobody_asks_cannot_fail(controllers):
-    near = closed_loop(controllers["koopman-mpc"], (km.faults.SolverFailure(1.0),), x0=(0.05, 0.0))
-    assert set(near.status) == {km.Status.UNCONSTRAINED}
-    for name in ("lqr", "koopman-lqr"):
-        assert not isinstance(controllers[name], km.control.Fallible)
-        bare, run = (closed_loop(controllers[name], faults) for faults in ((), (km.faults.SolverFailure(1.0),)))
-        assert np.array_equal(bare.U, run.U)
 
 
 def test_a_controller_that_raises_gets_its_solver_back():
@@ -397,8 +380,3 @@ def test_what_a_shifted_plan_of_blocked_moves_applies_is_the_plan_of_the_last_go
     assert planned[2] < planned[3]  # the second move, and the third
     assert run.fallback[1:] == (km.control.Fallback.SHIFTED_PLAN,) * 3
     assert np.array_equal(run.U, planned)
-
-
-def test_the_first_sample_always_arrives():
-    run = ramp((km.faults.DroppedSamples(1.0),))
-    assert np.array_equal(run.Y, np.tile(run.X[0], (9, 1)))

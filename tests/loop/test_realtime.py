@@ -214,23 +214,6 @@ def test_a_late_step_is_counted_and_its_input_is_applied_late_or_not_at_all(tmp_
     assert all(run.fallback[k] is km.control.Fallback.HOLD for k in skipped)
 
 
-def test_a_step_reads_when_it_begins_and_sees_the_rows_of_its_time():
-    class Reading(Here):
-        def read(self):
-            return [100.0 + len(self.got)]
-
-        def step(self, u):
-            super().step(u)
-
-    seen, controller = [], Toward()
-    km.realtime(
-        controller, Reading(), dt=DT, reference=[[1.0], [2.0], [3.0]], steps=4, watchdog=20, recorder=seen.append
-    )
-    rows = [1.0, 2.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0]
-    assert [step.y[0] for step in seen if np.isfinite(step.y[0])] == [100.0 + i for i in range(controller.calls)]
-    assert controller.ahead == [rows[step.k : step.k + 4] for step in seen if np.isfinite(step.y[0])]
-
-
 def test_a_controller_that_never_returns_is_interrupted_and_the_plant_is_safe():
     plant = Here()
     paced = km.realtime(Toward(at={2: lambda: time.sleep(1e6)}), plant, dt=DT, reference=[0.0], watchdog=1.0, safe=9.0)
@@ -273,20 +256,6 @@ def test_an_input_that_comes_after_the_watchdog_has_acted_never_reaches_the_plan
     assert ended == ["watchdog: the controller did not return within 0.2 s"]
     assert plant.got[-1] == 9.0
     assert plant.got.count(9.0) == 1
-
-
-def test_the_controller_is_told_the_input_that_the_plant_has():
-    told = []
-
-    class Asked(Counting):
-        def __call__(self, y, reference, applied=None, w=None):
-            told.append(None if applied is None else float(applied[0]))
-            return super().__call__(y, reference)
-
-    plant = Here()
-    km.realtime(Asked(), plant, dt=DT, reference=[0.0], steps=4, watchdog=20)
-    assert told == [None, *plant.got[:-1]][: len(told)]
-    assert len(told) > 1
 
 
 def test_a_plant_that_fails_once_is_made_safe_by_its_next_step():
