@@ -13,7 +13,7 @@ from koopmpc.apps.fitting.check import check_controller
 from koopmpc.apps.fitting.checked import RunKind
 from koopmpc.apps.fitting.verdict import judge_plant_runs, judge_rate, plan_verdict
 from koopmpc.control.move import PlanMemory
-from koopmpc.models.base import load_value, replace_report, save_value
+from koopmpc.models.base import change_model, load_value, save_value
 from koopmpc.synthesis.designed import SavedDesign, rebuild_controller
 from koopmpc.synthesis.search.recipe import get_model
 from tests.apps.mass import GOAL, NAMES, A, B, design, logs
@@ -261,7 +261,7 @@ def test_runs_in_a_late_log_are_judged_by_the_input_that_answered_each_row(made)
     late = km.Episodes([km.Episode(X=e.X, U=np.concatenate([np.zeros((1, 1)), e.U[:-1]])) for e in runs], 0.1, *NAMES)
     with pytest.raises(km.errors.DataError, match="the logs hold other runs"):
         judge_plant_runs(saved.evidence, controller, late)
-    controller.predictor = replace_report(model, replace(model.report, input_lead=1))
+    controller.predictor = change_model(model, report=replace(model.report, input_lead=1))
     assert judge_plant_runs(saved.evidence, controller, late).own > 0.99
 
 
