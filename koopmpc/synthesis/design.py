@@ -116,7 +116,7 @@ def design(
         results, floor = plan.run(pool, options)
         test = build_test(plan, results, floor, options, pool)
         for sentence in test.doubts:
-            warnings.warn(sentence, FitWarning, stacklevel=3)
+            warnings.warn(sentence, FitWarning, stacklevel=2)
         judged = judge_rounds(plan, results, floor, test, options, pool)
     chosen = choose_controller(judged, options, few, draw)
     return expect_loops(chosen, options, few, draw)

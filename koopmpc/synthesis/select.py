@@ -131,7 +131,7 @@ def select(
     feedback = isinstance(data, Episodes) and not (options.candidates is None and is_record(data))
     prepared = prepare_data(data, options, feedback=feedback, feedthrough=FEEDTHROUGH)
     for sentence in _list_doubts(prepared.held):
-        warnings.warn(sentence, FitWarning, stacklevel=3)
+        warnings.warn(sentence, FitWarning, stacklevel=2)
     prepared = take_out_noise(prepared)
     plan = _plan_search(prepared, options, (ahead, folds), draw)
     trials = _list_trials(plan, weights, relift)
@@ -151,7 +151,7 @@ def select(
                 f"the forecasts of {which} run away within {plan.horizon} steps, and the smallest is taken: trust no "
                 "controller of it; pass a shorter horizon, or candidates that know the plant",
                 FitWarning,
-                stacklevel=3,
+                stacklevel=2,
             )
             break
     return _fit_chosen(plan, options, ranked)
