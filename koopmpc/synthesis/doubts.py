@@ -196,37 +196,29 @@ def explain_unreachable(one: Surrogate, task: DesignTask) -> list[str]:
     ends = of(np.array([task.low, task.high]))
     tolerance = np.where(np.diag(Q) > 0, np.maximum(UNHELD * np.abs(ends[1] - ends[0]), 1e-9), np.inf)
 
-    def values(at: Equilibrium) -> Float[np.ndarray, " nr"]:
-        return of(at.x[:nx])
-
     def is_missed(at: Equilibrium) -> bool:
-        return bool((np.abs(values(at) - row) > tolerance).any())
+        return bool((np.abs(of(at.x[:nx]) - row) > tolerance).any())
 
     def format_outputs(numbers: Float[np.ndarray, " nr"]) -> str:
-        weighed = np.isfinite(tolerance)
         shown = np.where(np.abs(numbers) > 1e-3 * tolerance, numbers, 0.0)
-        return ", ".join(with_unit(of.names[i], f"= {shown[i]:.4g}") for i in np.flatnonzero(weighed))
-
-    room = UNHELD * (task.high - task.low)  # of the states
+        return ", ".join(with_unit(of.names[i], f"= {shown[i]:.4g}") for i in np.flatnonzero(np.isfinite(tolerance)))
 
     def list_broken(at: Equilibrium) -> list[str]:
-        ways: list[str] = []
-        for names, values, box, off in (
-            (model.inputs, at.u, task.limits.inputs(model.nu), 1e-6 * np.abs(at.u)),
-            (model.states, at.x[:nx], task.limits.states(nx), room),
-        ):
-            for i, (name, value, low, high) in enumerate(zip(names, values, *box, strict=True)):
-                if not low - off[i] <= value <= high + off[i]:
-                    shown = with_unit(name, f"= {value if abs(value) > 1e-3 * off[i] else 0:.4g}")
-                    ways.append(f"{shown}, and its limit is {low if value < low else high:.4g}")
-        return ways
+        names, values = (*model.inputs, *model.states), np.concatenate([at.u, at.x[:nx]])
+        off = np.concatenate([1e-6 * np.abs(at.u), UNHELD * (task.high - task.low)])
+        low, high = np.hstack([task.limits.inputs(model.nu), task.limits.states(nx)])
+        return [
+            f"{with_unit(names[i], f'= {values[i] if abs(values[i]) > 1e-3 * off[i] else 0:.4g}')}, and its limit is "
+            f"{low[i] if values[i] < low[i] else high[i]:.4g}"
+            for i in np.flatnonzero(~((values >= low - off) & (values <= high + off)))
+        ]
 
     inside = one.holding(cost, task.limits)(row)
     rests = not list_broken(inside)  # where no equilibrium is inside all limits, the search keeps those of inputs alone
     if rests and not is_missed(inside):
         return []
     free = one.holding(cost, Limits())(row)
-    nearest = f"the nearest that can be held is {format_outputs(values(inside))}"
+    nearest = f"the nearest that can be held is {format_outputs(of(inside.x[:nx]))}"
     if not rests:
         nearest = "the plant rests nowhere inside these limits: widen them"
     if is_missed(free):
