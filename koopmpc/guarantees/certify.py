@@ -67,6 +67,34 @@ class CertifyOptions:
     confidence: float = 0.95
     rng: np.random.Generator | int = 0
 
+    def __post_init__(self) -> None:
+        checks.kind(self.estimated, "estimated", (bool, np.bool_), "pass True or False")
+        if self.error is not None and self.lipschitz is not None:
+            raise DataError("error and lipschitz are both given; pass one of them")
+        if self.error is not None and self.estimated:
+            raise DataError(
+                "estimated=True measures the error on data; leave error out, or pass lipschitz in its place"
+            )
+        if self.error is not None and (checks.array(self.error, "error", (2,)) < 0).any():
+            raise DataError(f"error is {self.error}; its constants must be 0 or above")
+        if self.lipschitz is not None:
+            checks.positive(self.lipschitz, "lipschitz")
+        if not checks.positive(self.confidence, "confidence") < 1:
+            raise DataError(f"confidence is {self.confidence}; it must be above 0 and below 1")
+        if self.noise is not None and (checks.array(self.noise, "noise") < 0).any():
+            raise DataError(f"noise is {self.noise}; an error of measurement is 0 or above")
+        if self.decay is not None and not checks.positive(self.decay, "decay") < 1:
+            raise DataError(f"decay is {self.decay:g}, and V has to fall; pass a number below 1")
+        if self.lipschitz is not None and self.estimated and np.any(self.noise):
+            raise DataError("a covering needs exact pairs; leave noise out, or leave lipschitz out")
+
+    @property
+    def constants(self) -> tuple[float, ...]:
+        """The constants of the error that are given: two, one or none."""
+        if self.error is not None:
+            return float(self.error[0]), float(self.error[1])
+        return () if self.lipschitz is None else (float(self.lipschitz),)
+
 
 def certify(
     model: BilinearPredictor | LinearPredictor,
@@ -133,21 +161,25 @@ def certify(
     """
     refuse_moved(moved, CertifyOptions, "km.guarantees.CertifyOptions")
     deviation = deviate(model, x, u)
-    asked = _check_options(CertifyOptions() if options is None else options, model.nx)
+    asked = CertifyOptions() if options is None else options
+    checks.kind(asked, "options", CertifyOptions, "pass km.guarantees.CertifyOptions(…)")
+    noise = np.zeros(model.nx) if asked.noise is None else checks.vector(asked.noise, "noise", model.nx)
+    seed = int(checks.generator(asked.rng).integers(2**32))
     if asked.estimated:
         deviation = deviate(model, x, _estimate_input(deviation))
-    whole, few = _Search(deviation, data, limits, asked), None
+    whole, few = _Search(deviation, data, limits, asked, noise, seed), None
     # with more observables than this only the states are tried
     provable = len(deviation.kept) <= 16 and is_stabilisable(deviation, asked.decay or DECAY)
     best = whole.run() if provable else None
     if not asked.constants and len(deviation.kept) > model.nx:
-        few = _Search(reduce_to_states(deviation), data, limits, asked)
+        few = _Search(reduce_to_states(deviation), data, limits, asked, noise, seed)
         other = few.run()
         if other is not None and (best is None or other.size > best.size):
             best, deviation = other, few.model
     if best is None:
         raise CertificateError(explain_refusal((few or whole).describe_failure()))
-    bound = best.bound if asked.constants else replace(best.bound, confidence=asked.confidence)  # whichever was chosen
+    # the confidence is that of whichever bound was chosen
+    bound = best.bound if asked.constants else replace(best.bound, confidence=float(asked.confidence))
     return Certificate(
         deviation=deviation,
         P=best.P,
@@ -161,7 +193,7 @@ def certify(
         v_max=whole.room.inputs,
         margin=best.margin,
         estimated=asked.estimated,
-        noise=asked.noise,
+        noise=noise,
         dt=model.dt,
         states=tuple(model.states),
         inputs=tuple(model.inputs),
@@ -170,56 +202,24 @@ def certify(
     )
 
 
-@dataclass(frozen=True)
-class _Asked:
-    """The options of `certify`, checked; `constants` are two, one or none; `level` is the confidence of one bound."""
-
-    constants: tuple[float, ...]
-    estimated: bool
-    region: Corners | None
-    noise: Float[np.ndarray, " nx"]
-    decay: float | None
-    confidence: float
-    level: float
-    seed: int
-
-
-def _check_options(options: CertifyOptions, nx: int) -> _Asked:
-    checks.kind(options, "options", CertifyOptions, "pass km.guarantees.CertifyOptions(…)")
-    source = checks.generator(options.rng)
-    constants = _check_constants(options.error, options.lipschitz, options.estimated)
-    confidence = checks.positive(options.confidence, "confidence")
-    if not confidence < 1:
-        raise DataError(f"confidence is {confidence}; it must be above 0 and below 1")
-    noise = np.zeros(nx) if options.noise is None else checks.vector(options.noise, "noise", nx)
-    if (noise < 0).any():
-        raise DataError(f"noise is {options.noise}; an error of measurement is 0 or above")
-    if options.decay is not None and not checks.positive(options.decay, "decay") < 1:
-        raise DataError(f"decay is {options.decay:g}, and V has to fall; pass a number below 1")
-    if options.lipschitz is not None and options.estimated and noise.any():
-        raise DataError("a covering needs exact pairs; leave noise out, or leave lipschitz out")
-    return _Asked(
-        constants=constants,
-        estimated=options.estimated,
-        region=options.region,
-        noise=noise,
-        decay=options.decay,
-        confidence=float(confidence),
-        level=1 - (1 - confidence) / (2 * len(_SCALES)),  # one of so many bounds is chosen
-        seed=int(source.integers(2**32)),
-    )
-
-
 class _Search:
     """The search over shares of the box, for one set of observables."""
 
-    def __init__(self, model: DeviationModel, data: Episodes, limits: Limits | None, asked: _Asked) -> None:
-        self.model, self.asked = model, asked
+    def __init__(
+        self,
+        model: DeviationModel,
+        data: Episodes,
+        limits: Limits | None,
+        asked: CertifyOptions,
+        noise: Float[np.ndarray, " nx"],
+        seed: int,
+    ) -> None:
+        self.model, self.asked, self.seed = model, asked, seed
         self.pairs = _read_pairs(model, data)
         sampled = len(asked.constants) != 2
         self.sizing = self.pairs
         if not asked.constants:  # a scenario bound takes box, sizes and shape as given: they are of other episodes
-            self.sizing, self.bounding = split_pairs(self.pairs, np.random.default_rng(asked.seed), share=0.5)
+            self.sizing, self.bounding = split_pairs(self.pairs, np.random.default_rng(seed), share=0.5)
         self.room, self.low, self.high = find_room(
             model, self.sizing, limits, asked.region, sampled=sampled, scenario=not asked.constants
         )
@@ -230,8 +230,8 @@ class _Search:
             )
         self.phi_size, self.v_size = sizes_of(inside.phi), sizes_of(inside.v)
         self.slope = None
-        if asked.noise.any():
-            self.slope = _noise_in_lifting(model, self.low, self.high, asked.noise, np.random.default_rng(asked.seed))
+        if noise.any():
+            self.slope = _noise_in_lifting(model, self.low, self.high, noise, np.random.default_rng(seed))
 
     def find_bound(self, scale: float) -> ErrorBound | None:
         """Return the bound on this share of the box, None where there are too few pairs."""
@@ -256,7 +256,7 @@ class _Search:
             )
         if given:
             return bound_by_lipschitz(given[0], sizing, self.phi_size, self.v_size)
-        calibration, held_out = split_pairs(self.bounding.within(low, high), np.random.default_rng(asked.seed))
+        calibration, held_out = split_pairs(self.bounding.within(low, high), np.random.default_rng(self.seed))
         return bound_by_scenario(
             calibration,
             shape_of(sizing, self.phi_size),
@@ -264,7 +264,7 @@ class _Search:
             self.v_size,
             sizing=sizing,
             constant=asked.estimated or self.slope is not None,
-            confidence=asked.level,
+            confidence=1 - (1 - asked.confidence) / (2 * len(_SCALES)),  # one of so many bounds is chosen
             held_out=held_out,
         )
 
@@ -298,21 +298,6 @@ class _Search:
             elif best is not None:
                 worse += 1
         return best
-
-
-def _check_constants(error: tuple[float, float] | None, lipschitz: float | None, estimated: bool) -> tuple[float, ...]:
-    """Return the constants that the user gives: two, one or none."""
-    checks.kind(estimated, "estimated", (bool, np.bool_), "pass True or False")
-    if error is not None and lipschitz is not None:
-        raise DataError("error and lipschitz are both given; pass one of them")
-    if error is not None and estimated:
-        raise DataError("estimated=True measures the error on data; leave error out, or pass lipschitz in its place")
-    if error is not None:
-        c = checks.array(error, "error", (2,))
-        if (c < 0).any():
-            raise DataError(f"error is {error}; its constants must be 0 or above")
-        return float(c[0]), float(c[1])
-    return () if lipschitz is None else (checks.positive(lipschitz, "lipschitz"),)
 
 
 def _estimate_input(model: DeviationModel) -> Float[np.ndarray, " m"]:
