@@ -20,7 +20,7 @@ from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status
 from koopmpc.control.program import SavedController
 from koopmpc.loop.controllers import count_disturbances
-from koopmpc.loop.parts import ControllerPair, plan_of, rows_of
+from koopmpc.loop.guarded import ControllerPair, plan_of, rows_of
 
 Mode = Literal["manual", "automatic", "standby"]
 
