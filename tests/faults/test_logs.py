@@ -42,9 +42,7 @@ def test_a_recording_of_something_else_is_refused(tmp_path: Path) -> None:
     other.log("state", rr.Scalars([1.0]))
     other.flush()
     other.disconnect()
-    with pytest.raises(
-        km.errors.LogError, match=r"other\.rrd is a Rerun recording, but no log of koopmpc: it has no description"
-    ):
+    with pytest.raises(km.errors.LogError, match=r"other\.rrd is a Rerun recording, but no log of koopmpc: it has no"):
         km.load_run(tmp_path / "other.rrd")
 
 
@@ -230,9 +228,7 @@ def test_a_log_of_another_format_is_refused(tmp_path: Path) -> None:
     data = path.read_bytes()
     assert b'"koopmpc-log-2"' in data
     (tmp_path / "new.rrd").write_bytes(data.replace(b'"koopmpc-log-2"', b'"koopmpc-log-9"'))
-    with pytest.raises(
-        km.errors.LogError, match="the description has format 'koopmpc-log-9', this koopmpc reads 'koopmpc-log-2'"
-    ):
+    with pytest.raises(km.errors.LogError, match="the description has format 'koopmpc-log-9', this koopmpc reads"):
         km.load_run(tmp_path / "new.rrd")
 
 

@@ -342,9 +342,7 @@ class Loud(km.faults.Fault):
 
 def test_a_fault_of_your_own_is_any_object_that_starts():
     assert ramp((Loud(2.0),)).U[:, 0].tolist() == [2.0 * k for k in range(1, 9)]
-    with pytest.raises(
-        km.errors.DataError, match=r"the faults made u = \[inf\] of u = \[1\.\] at step 0; they must keep"
-    ):
+    with pytest.raises(km.errors.DataError, match=r"the faults made u = \[inf\] of u = \[1\.\] at step 0; they must"):
         ramp((Loud(np.inf),))
 
 
