@@ -196,7 +196,7 @@ class MPCBase(PredictiveController):
         self._initial = InitialCondition(
             model, observer, self._N, self._latency, with_rates=self._with_rates, estimated=estimator is not None
         )
-        levels = self.limits.base.input_levels(self.nu)
+        levels = tracking.levels
         self._held = None if levels is None else HeldLevels(levels)
         self._memory = PlanMemory(self.nu, np.arange(self._N), self._held, self._latency, self._allowed)
         MPCBase.reset(self)
@@ -212,23 +212,14 @@ class MPCBase(PredictiveController):
             x0 or u_prev is of another length, or holds what is no finite number; pass None where it is not known.
         """
         self._memory.reset(u_prev, self._present_limits()[0])
-        self._initial.reset(x0, self._given)
+        self._initial.reset(x0, self._memory.given)
         if self._watch is not None:
             self._watch.reset()
-
-    @property
-    def _given(self) -> Float[np.ndarray, " nu"]:
-        """The last input returned."""
-        return self._memory.given
 
     @property
     def _planned(self) -> bool:
         """Whether the last step had a plan."""
         return self._memory.is_planned
-
-    def _count_held(self, applied: ArrayLike | None) -> None:
-        """Count the step for which the input that acted, or that was returned last, held its levels."""
-        self._memory.take(applied)
 
     def _present_limits(self) -> tuple[Interval, Interval | None]:
         """Return the box of the next input and that of its change; a subclass knows where they move in time."""

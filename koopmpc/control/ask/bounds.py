@@ -204,11 +204,6 @@ def preview_margin(margin: Float[np.ndarray, "K n"], N: int) -> Float[np.ndarray
     return margin[np.minimum(np.arange(N), len(margin) - 1)]
 
 
-def is_finite(box: Interval) -> Bool[np.ndarray, " n"]:
-    """Return which rows have a limit."""
-    return np.isfinite(box.low) | np.isfinite(box.high)
-
-
 def half_width(box: Interval) -> Float[np.ndarray, " n"]:
     """Return half the width of limits with two finite ends, NaN where there are fewer, or no width."""
     low, high = box

@@ -289,16 +289,6 @@ def evaluate_stage(
     return trace_stage(stage, X.shape[1], U.shape[1]).evaluate(np.hstack([X, U]))[:, 0]
 
 
-def add_held(
-    first: Float[np.ndarray, "K nu"] | None, second: Float[np.ndarray, "M nu"] | None
-) -> Float[np.ndarray, "T nu"] | None:
-    """Return the sum of two tables whose last rows are held; None where neither is there."""
-    if first is None or second is None:
-        return second if first is None else first
-    steps = np.arange(max(len(first), len(second)))
-    return first[np.minimum(steps, len(first) - 1)] + second[np.minimum(steps, len(second) - 1)]
-
-
 def refuse_steps(cost: Cost, limits: Limits) -> None:
     """Raise where limits have rows in time or inputs a price, for a law or a search that knows neither."""
     if limits.in_time:

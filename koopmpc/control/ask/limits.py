@@ -23,10 +23,10 @@ from koopmpc.control.ask.bounds import Slack as Slack
 from koopmpc.control.ask.bounds import Softness as Softness
 from koopmpc.control.ask.bounds import clip_input as clip_input
 from koopmpc.control.ask.bounds import half_width as half_width
-from koopmpc.control.ask.bounds import is_finite, spread_prices, write_rows
 from koopmpc.control.ask.bounds import magnitude as magnitude
 from koopmpc.control.ask.bounds import measure_violation as measure_violation
 from koopmpc.control.ask.bounds import preview_margin as preview_margin
+from koopmpc.control.ask.bounds import spread_prices, write_rows
 from koopmpc.control.ask.checks import BOUNDS as BOUNDS
 from koopmpc.control.ask.checks import ENDS, LIMIT_CHECKS, refuse_crossed, refuse_margin
 from koopmpc.control.ask.levels import DwellByInput, InputLevels, LevelsByInput, build_levels
@@ -235,8 +235,10 @@ class Limits(Value):
     def movable(self, nx: int, ny: int, nu: int) -> "Movable":
         """Return which inputs, rates and outputs [x; of(x)] have a row: those with a finite or a declared bound."""
         base = self.base
-        inputs = is_finite(base.inputs(nu)) | _declares(self, "u")
-        return Movable(inputs, is_finite(_change_box(base, nu)) | _declares(self, "du"), base.find_rows(nx, ny).kept)
+        inputs = np.isfinite(base.inputs(nu)).any(axis=0) | _declares(self, "u")
+        return Movable(
+            inputs, np.isfinite(_change_box(base, nu)).any(axis=0) | _declares(self, "du"), base.find_rows(nx, ny).kept
+        )
 
     def tightened(self, band: ArrayLike, most: float = TIGHTEST, *, states: Sequence[str] = ()) -> "Limits":
         """Return the limits with margins: at step k of the horizon by the error band of min(k, 5) steps.
@@ -312,7 +314,7 @@ class Limits(Value):
     def rates(self, nu: int) -> Interval | None:
         """Return the box of u_k − u_{k−1}; None where nothing limits it."""
         box = _change_box(self, nu)
-        return box if _declares(self, "du") or is_finite(box).any() else None
+        return box if _declares(self, "du") or np.isfinite(box).any() else None
 
     def rate_softness(self, nu: int) -> Softness:
         """Return how soft the rate limits of each input are."""
@@ -342,7 +344,9 @@ class Limits(Value):
             mine = np.repeat(asked, [nx, ny])
             given = spread_prices(self.slack, "slack", int(mine.sum()), "one a state, then one an output")
             linear[mine], quadratic[mine] = given
-        kept = is_finite(Interval(low, high)) | np.repeat([_declares(self, "x"), _declares(self, "y")], [nx, ny])
+        kept = np.isfinite(Interval(low, high)).any(axis=0) | np.repeat(
+            [_declares(self, "x"), _declares(self, "y")], [nx, ny]
+        )
         softness = Softness(linear[kept], quadratic[kept], SOFTENED * size[kept])
         margin = np.zeros((1, nx + ny))
         if self.margin is not None:

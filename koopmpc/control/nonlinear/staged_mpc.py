@@ -232,8 +232,8 @@ class StagedMPC(MPCBase):
     def _step(
         self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None, w: ArrayLike | None, start: float
     ) -> Move:
-        self._initial.take(y, self._given, applied, w)
-        self._count_held(applied)
+        self._initial.take(y, self._memory.given, applied, w)
+        self._memory.take(applied)
         begin = self._begin(checks.numbers(reference, "reference") + 0.0, start)  # -0.0 and 0.0 are the same row
         if begin is None:
             return self._lose(applied, Status.BAD_MEASUREMENT, 0, start)
@@ -249,7 +249,7 @@ class StagedMPC(MPCBase):
     def _begin(self, reference: Float[np.ndarray, "..."], start: float) -> PlanStart | None:
         """Return where the plan starts, its limits and its targets; None where y, w or the reference is not finite."""
         initial = self._initial
-        x, u_prev = initial.z, initial.u_prev if initial.u_prev.size else self._given
+        x, u_prev = initial.z, initial.u_prev if initial.u_prev.size else self._memory.given
         if self._problem.timed:
             self._pass_weights()
         if not np.abs(x).max() < HUGE or (self._disturbed and not self._disturb()):

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError
-from koopmpc.control.ask.cost import add_held
 from koopmpc.control.ask.limits import Interval, Softness, preview_margin
 from koopmpc.control.ask.terminal import EndRows, read_end
 from koopmpc.control.horizon import Condensed, Horizon, Terminal, WeightRows, build_stages, condense, horizon_of
@@ -32,6 +31,7 @@ from koopmpc.control.solvers import FINISHER
 from koopmpc.control.solvers.ball import make_ball
 from koopmpc.control.solvers.base import StepQP
 from koopmpc.control.solvers.daqp import daqp_settings
+from koopmpc.control.solvers.order import LONG, SPARSE
 from koopmpc.control.solvers.priorities import spread_priorities
 from koopmpc.control.solvers.stages import QPStages
 from koopmpc.control.target import ROUNDING, Targets, Units, targets_of
@@ -100,7 +100,7 @@ def limit_plan(
         low[last - len(margin) : last] += margin
         high[last - len(margin) : last] -= margin
     searched = np.zeros(nu, dtype=np.bool_)  # a search over levels needs limits of held inputs, too
-    levels = track.limits.base.input_levels(nu) if held.any() else None
+    levels = track.levels if held.any() else None
     if levels is not None:
         searched[levels.which] = True
     free = np.flatnonzero(np.concatenate([(held & ~searched).ravel(), held.ravel()][: 1 + (track.rates is not None)]))
@@ -144,7 +144,7 @@ def plan_condensed(task: ControlTask) -> CondensedProgram:
     track, model, limits = task.track, task.predictor, task.track.limits
     targets = targets_of(model, track)
     plan, terminal = plan_matrices(task, targets)
-    levels, blocks = limits.base.input_levels(model.nu), task.moves.lengths
+    levels, blocks = track.levels, task.moves.lengths
     for what, given in (("levels", levels), ("a priority", limits.priority)):
         if given is not None and plan.ball is not None:
             raise DataError(f"the limits have {what} and a terminal ellipsoid; pass a polytope, or no terminal set")
@@ -157,7 +157,7 @@ def plan_condensed(task: ControlTask) -> CondensedProgram:
         targets=targets,
         inputs=track.inputs,
         rates=track.rates,
-        given=add_held(track.given, track.shift),
+        given=_add_held(track.given, track.shift),
         reference=np.zeros((1, len(track.Q))),
         N=task.N,
         latency=task.latency,
@@ -184,12 +184,22 @@ def plan_condensed(task: ControlTask) -> CondensedProgram:
     return replace(program, plans=plans)
 
 
+def _add_held(
+    first: Float[np.ndarray, "K nu"] | None, second: Float[np.ndarray, "M nu"] | None
+) -> Float[np.ndarray, "T nu"] | None:
+    """Return the sum of two tables whose last rows are held; None where neither is there."""
+    if first is None or second is None:
+        return second if first is None else first
+    steps = np.arange(max(len(first), len(second)))
+    return first[np.minimum(steps, len(first) - 1)] + second[np.minimum(steps, len(second) - 1)]
+
+
 def _bound_steps(task: ControlTask, targets: Targets, plan: CondensedPlan) -> PlanBounds:
     """Return the limits of each step."""
     track = task.track
     if track.limits.in_time:
         return BoundRows(task, targets, plan).read(track.limits, at_call=False)
-    step = StepBounds(plan.low, plan.high, plan.unpushed if plan.aimed and not plan.is_driven else HUGE)
+    step = StepBounds(plan.low, plan.high, HUGE if plan.disturbance.size or not plan.aimed else plan.unpushed)
     moves = Interval(*(np.tile(side, len(task.moves.lengths)) for side in track.inputs))
     return ConstantBounds(step, track.inputs, track.rates, track.hard_rates, moves)
 
@@ -209,9 +219,10 @@ def plan_matrices(
     law = recursion(parts, terminal.P, terminal.p)
     wanted = track.limits.terminal
     end = None if wanted is None else read_end(wanted, predictor)
-    coordinates = "riccati" if moves.own else task.coordinates
+    tied = bool(moves.held.any())
+    coordinates = "riccati" if tied else task.coordinates
     maps = condense(scaled_horizon, law, terminal, aims, units, coordinates, end)
-    if moves.own:
+    if tied:
         maps = tie_moves(maps, moves.held)
     if track.pull is not None:  # an end of one's own does not count the price
         counted = horizon.N + (track.cost.Q_N is None)
@@ -219,8 +230,8 @@ def plan_matrices(
         maps = replace(maps, offset=maps.offset + maps.from_reference @ pulled)
     scaled = _scale_deviation(maps, track.inputs, len(moves.lengths))
     stages = None
-    plain = not moves.own and end is None and len(horizon.blocks) == horizon.N
-    if task.is_long and not track.weighed and plain and maps.coordinates == "riccati":
+    plain = not (tied or track.weighed) and end is None and len(horizon.blocks) == horizon.N
+    if (task.solver == SPARSE or task.N >= LONG) and plain and maps.coordinates == "riccati":
         columns = np.diagonal(scaled.deviation) / np.diagonal(maps.deviation)
         stages = _keep_stages(scaled_horizon, parts[0], law, terminal.P, units, columns, units.scale / scaled.unit)
     limits = limit_plan(track, horizon, scaled.deviation, end, moves.held)
@@ -246,6 +257,7 @@ def _assemble(
     last = horizon.rest_disturbance()
     disturbance = np.zeros((len(horizon.A), 0)) if last is None else last[:, :-1]
     driven, aimed = disturbance.shape[1] > 0, bool(maps.from_target.any())
+    maps = _fold_targets(maps, targets) if aimed else maps
     limited = np.concatenate([track.movable.inputs, np.ones(len(track.outputs.low), np.bool_)])
     checked, from_state, from_drive = np.zeros(len(targets.low), np.bool_), maps.from_state, np.zeros((len(low), 0))
     rounding = ROUNDING * targets.size[limited]
@@ -266,7 +278,6 @@ def _assemble(
         from_drive = np.vstack([from_drive + per_step @ from_disturbance, moved, moved])
         from_state = np.vstack([from_state, np.zeros((2 * len(moved), horizon.size))])
         low, high = np.concatenate([low, target_low, -free]), np.concatenate([high, free, target_high])
-    maps = _fold_targets(maps, targets) if aimed else maps
     return CondensedPlan(
         M=np.ascontiguousarray(np.hstack([from_state, from_drive])),
         low=np.maximum(low, -HUGE),  # inf meets no limit

@@ -30,6 +30,16 @@ class StepBounds(NamedTuple):
     high: Float[np.ndarray, " nt"]
     reach: float
 
+    def accepts(self, t: Float[np.ndarray, " n"], ball: Ball | None) -> bool:
+        """Return whether the first entries t of a plan are inside, those of a terminal ellipsoid by their norm."""
+        low, high = self.low[: len(t)], self.high[: len(t)]
+        if is_inside(t, low, high):
+            return True
+        if ball is None or not ball.contains(t):
+            return False
+        others = slice(0, ball.rows.start), slice(ball.rows.stop, None)
+        return all(is_inside(t[part], low[part], high[part]) for part in others)
+
 
 def is_inside(v: Float[np.ndarray, " n"], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]) -> bool:
     """Return whether low ≤ v ≤ high in all entries; NaN is not. A search in bytes is five times as fast as all()."""
@@ -203,11 +213,6 @@ class CondensedPlan(Value):
     deviation: Float[np.ndarray, "moves nw"]
     coordinates: str
     ball: Ball | None
-
-    @property
-    def is_driven(self) -> bool:
-        """Whether disturbances move the plan, and its targets."""
-        return self.disturbance.shape[1] > 0
 
 
 @runtime_checkable

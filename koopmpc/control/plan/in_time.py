@@ -51,7 +51,7 @@ class BoundRows:
     def __init__(self, task: ControlTask, targets: Targets, plan: CondensedPlan) -> None:
         self.track, self.targets, self.latency, self.N = task.track, targets, task.latency, task.N
         self.states, self.inputs = task.predictor.states, task.predictor.inputs
-        self.aims_inside = plan.aimed and not plan.is_driven
+        self.aims_inside = plan.aimed and not plan.disturbance.size
         self.program = rows = describe_bounds(task, targets, plan)
         track, wanted = self.track, self.track.limits.terminal
         self.end = None if wanted is None else read_end(wanted, task.predictor)

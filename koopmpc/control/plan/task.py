@@ -174,11 +174,6 @@ class ControlTask:
         """Steps of the plan."""
         return sum(self.moves.lengths)
 
-    @property
-    def is_long(self) -> bool:
-        """Whether a solver may want the QP before condensing, a stage a step."""
-        return self.solver == order.SPARSE or self.N >= order.LONG
-
     def with_predictor(self, predictor: LinearPredictor) -> "ControlTask":
         """Return the task on another predictor of the same lifting."""
         checks.kind(predictor, "predictor", LinearPredictor, "it replaces another LinearPredictor")

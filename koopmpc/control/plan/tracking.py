@@ -13,6 +13,7 @@ from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.control.ask.bounds import SOFTENED, SizedLimits, spread_prices
 from koopmpc.control.ask.cost import Cost, check_cost_and_limits, refuse_stage, refuse_steps
+from koopmpc.control.ask.levels import InputLevels
 from koopmpc.control.ask.limits import LINEAR, QUADRATIC, Interval, Limits, Movable, Softness, half_width, magnitude
 from koopmpc.lifting.base import Lifting, find_observables
 from koopmpc.lifting.state import State
@@ -47,7 +48,7 @@ class Sizes(NamedTuple):
         ranges: Mapping[str, float] | None,
     ) -> "Sizes":
         """Return the sizes under the weights of a cost and limits; `ranges` are half of those of the data, by name."""
-        nu, known = len(R), dict(ranges or {})
+        nu, known, limits = len(R), dict(ranges or {}), limits.base
         names = [*states, *(() if limits.of is None else limits.of.bind(states).names)]
         ends, inputs = limits.ends(len(states), len(names) - len(states)), limits.inputs(nu)
         known |= {name: float(half) for name, half in zip(names, half_width(ends), strict=True) if half > 0}
@@ -96,8 +97,9 @@ class Tracking(Generic[Read]):
     `with_rates` says whether there is either. `hard_rates` are those of `SizedLimits`. `given` are the rows of a
     u_target that is given as numbers, None for one by name. `Q_root` and `R_root` are S with SᵀS = Q and R. `sizes` are
     those of states, inputs, limits and cost. Where limits have rows, all these are of their widest values, and
-    `movable` says which inputs, rates and outputs [x; of(x)] have a limit, or may get one. `shift` is what a price adds
-    to u_r, `pull` what an output price adds to the reference; `weighed` says that weights move in time.
+    `movable` says which inputs, rates and outputs [x; of(x)] have a limit, or may get one. `levels` are those of the
+    inputs. `shift` is what a price adds to u_r, `pull` what an output price adds to the reference; `weighed` says that
+    weights move in time.
     """
 
     cost: Cost
@@ -120,6 +122,7 @@ class Tracking(Generic[Read]):
     R_root: Float[np.ndarray, "nu nu"]
     sizes: Sizes
     movable: Movable
+    levels: InputLevels | None
     shift: Float[np.ndarray, "prices nu"] | None
     pull: Float[np.ndarray, " nr"] | None
     weighed: bool
@@ -229,8 +232,8 @@ def _tracking(
     if cost.weighs_in_time:
         cost.weight_rows(nr, nu, 0, 1)  # checks their sizes
     (Q, R), R_delta, rows = cost.matrices(nr, nu), cost.rate(nu), cost.given_inputs(nu)
-    base = limits.base
-    sizes = Sizes.of(cost.of.bind(states), Q, R, base, states, ranges)
+    shift, pull = cost.find_shift(nu), cost.find_pull(nr)
+    sizes, base = Sizes.of(cost.of.bind(states), Q, R, limits, states, ranges), limits.base
     sized = size_limits(base, nx, len(sizes.rows) - nx, nu, sizes.rows, sizes.scale)
     low, high = sized.inputs
     if rows is not None:
@@ -263,8 +266,9 @@ def _tracking(
         R_root=checks.root(R),
         sizes=sizes,
         movable=base.movable(nx, len(sizes.rows) - nx, nu),
-        shift=cost.find_shift(nu),
-        pull=cost.find_pull(nr),
+        levels=base.input_levels(nu),
+        shift=shift,
+        pull=pull,
         weighed=cost.weighs_in_time,
     )
 

@@ -21,7 +21,7 @@ from koopmpc.control.plan.condensed_program import (
     is_inside,
 )
 from koopmpc.control.solvers import FINISHER, add_sparse, exact_turn, order_solvers
-from koopmpc.control.solvers.ball import Ball, BallSolver
+from koopmpc.control.solvers.ball import BallSolver
 from koopmpc.control.solvers.base import StepSolver
 from koopmpc.control.solvers.levels import LevelSearch, LevelSolver
 from koopmpc.control.solvers.priorities import PrioritySolver
@@ -91,29 +91,13 @@ class DeviationSolver:
         else:
             self.qps.update(plan.qp)
 
-    def accepts(
-        self,
-        t: Float[np.ndarray, " nt"],
-        low: Float[np.ndarray, " nt"],
-        high: Float[np.ndarray, " nt"],
-        ball: Ball | None,
-    ) -> bool:
-        """Return whether a plan meets all limits, levels and a terminal ellipsoid included."""
-        if not is_inside(t, low, high):
-            if ball is None or not ball.contains(t):
-                return False
-            others = slice(0, ball.rows.start), slice(ball.rows.stop, None)
-            if not all(is_inside(t[part], low[part], high[part]) for part in others):
-                return False
-        return self.levels is None or self.levels.accepts(t)
-
     def solve(
         self,
         t: Float[np.ndarray, " nt"],
         plan: CondensedPlan,
         bounds: PlanBounds,
         k: int,
-        u_prev: Float[np.ndarray, " nu"],
+        initial: InitialCondition,
         deadline: float | None,
     ) -> Corrected:
         """Move the plan t by the optimal deviation, and return how the QP ended; the plan stays where it failed.
@@ -122,25 +106,25 @@ class DeviationSolver:
         ----------
         bounds, k
             The limits, and the step.
-        u_prev
-            The input before the plan's first one; empty where it does not count.
+        initial
+            Where the plan starts.
         deadline
             The time by `perf_counter` at which the step must have ended; None for none.
         """
+        u_prev = initial.u_prev
         limits, conflict = bounds.open_rates(k, u_prev)
         rows = None if limits is None else _scale_limits(limits, plan)
-        inputs, hard_rates = bounds.first(k)[0], bounds.hard_rates(k)
+        (inputs, rates), hard_rates, box = bounds.first(k), bounds.hard_rates(k), bounds.moves(k)
         room = None if hard_rates is None else Interval(inputs.low - u_prev, inputs.high - u_prev)
         found, slack = self.qps.solve(t[: len(plan.offset)], room, deadline, rows)
         status = Status.FAILED if self.fails else found.status
         if status is not Status.OPTIMAL:
             self.qps.cool()
             return Corrected(status, found.iterations, found.solver)
-        slack, U, box = max(slack, conflict), t[: len(plan.deviation)], bounds.moves(k)
+        slack, U = max(slack, conflict), t[: len(plan.deviation)]
         U += plan.deviation.dot(found.v)
         if slack and self.levels is None and found.solver == FINISHER.name and found.y.dot(found.y) > _FAR:
-            rates = len(U) if bounds.first(k)[1] is not None else 0
-            _meet_limits(U, found.y, plan, box, rows, u_prev, rates)
+            _meet_limits(U, found.y, plan, box, rows, u_prev, 0 if rates is None else len(U))
         np.maximum(U, box.low, out=U)
         np.minimum(U, box.high, out=U)
         if hard_rates is not None:
@@ -219,13 +203,12 @@ class CondensedStep:
         model, allowed = program.model, np.inf if program.time_limit is None else program.time_limit
         levels = None if program.input_levels is None else HeldLevels(program.input_levels)
         estimated = program.rule is not None
+        self._nu, self.solver = model.nu, DeviationSolver(program, levels)
         self.initial = InitialCondition(
             model, observer, program.N, program.latency, with_rates=program.with_rates, estimated=estimated
         )
-        self.memory = PlanMemory(model.nu, program.move_of, levels, program.latency, allowed)
-        self.solver = DeviationSolver(program, levels)
-        self._nu = model.nu
         self._take(program)
+        self.memory = PlanMemory(model.nu, program.move_of, levels, program.latency, allowed)
 
     def update(self, program: CondensedProgram, model: object) -> None:
         """Go on with another program of the same sizes: the plan, the warm start and the last input are kept."""
@@ -280,7 +263,7 @@ class CondensedStep:
         t += aim.at(plan, bounds, row, limits.reach)
         if given is not None:
             t[: len(given)] += given
-        if self.solver.accepts(t, limits.low, limits.high, plan.ball):
+        if limits.accepts(t, plan.ball) and (self.solver.levels is None or self.solver.levels.accepts(t)):
             return self._return_free(t[: self._nu], t, start)
         return self._correct(t, plan, limits, applied, start)
 
@@ -312,10 +295,10 @@ class CondensedStep:
             moved = self._aim.find_push(plan.disturbance @ self.initial.drive, bounds.targets(row))
             if moved is not None:
                 t[:n] += plan.from_target.dot(moved)
-            if self.solver.accepts(t[:n], limits.low[:n], limits.high[:n], plan.ball):
+            if limits.accepts(t[:n], plan.ball) and (self.solver.levels is None or self.solver.levels.accepts(t[:n])):
                 return self._return_free(t[: self._nu], t, start)
         deadline = None if np.isinf(memory.allowed) else start + memory.allowed
-        found = self.solver.solve(t, plan, bounds, row, self.initial.u_prev, deadline)
+        found = self.solver.solve(t, plan, bounds, row, self.initial, deadline)
         if not found.is_solved:
             return self._fall_back(found, t[: self._nu], applied, start)
         u = t[: self._nu]
