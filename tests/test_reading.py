@@ -76,10 +76,10 @@ MOST = {  # files, returns
     # what the third house has reached so far; asked: KoopmanMPC 10, its step 5, BilinearMPC 10, its step 6, design 50, fit 45
     "edmd": (10, 7),
     "bilinear_edmd": (10, 7),
-    "KoopmanMPC": (28, 35),
-    "step": (11, 8),
-    "BilinearMPC": (23, 29),
-    "bilinear_step": (18, 27),
+    "KoopmanMPC": (22, 31),
+    "step": (7, 8),
+    "BilinearMPC": (22, 29),
+    "bilinear_step": (17, 26),
     "simulate": (17, 24),
     # with the files of the ground and of liftings, which those above leave out
     "simulate_all": (19, 30),

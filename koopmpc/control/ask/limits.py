@@ -235,10 +235,8 @@ class Limits(Value):
     def movable(self, nx: int, ny: int, nu: int) -> "Movable":
         """Return which inputs, rates and outputs [x; of(x)] have a row: those with a finite or a declared bound."""
         base = self.base
-        inputs = np.isfinite(base.inputs(nu)).any(axis=0) | _declares(self, "u")
-        return Movable(
-            inputs, np.isfinite(_change_box(base, nu)).any(axis=0) | _declares(self, "du"), base.find_rows(nx, ny).kept
-        )
+        inputs, changes = (np.isfinite(box).any(axis=0) for box in (base.inputs(nu), _change_box(base, nu)))
+        return Movable(inputs | _declares(self, "u"), changes | _declares(self, "du"), base.find_rows(nx, ny).kept)
 
     def tightened(self, band: ArrayLike, most: float = TIGHTEST, *, states: Sequence[str] = ()) -> "Limits":
         """Return the limits with margins: at step k of the horizon by the error band of min(k, 5) steps.
@@ -344,9 +342,7 @@ class Limits(Value):
             mine = np.repeat(asked, [nx, ny])
             given = spread_prices(self.slack, "slack", int(mine.sum()), "one a state, then one an output")
             linear[mine], quadratic[mine] = given
-        kept = np.isfinite(Interval(low, high)).any(axis=0) | np.repeat(
-            [_declares(self, "x"), _declares(self, "y")], [nx, ny]
-        )
+        kept = np.isfinite(low) | np.isfinite(high) | np.repeat([_declares(self, what) for what in "xy"], [nx, ny])
         softness = Softness(linear[kept], quadratic[kept], SOFTENED * size[kept])
         margin = np.zeros((1, nx + ny))
         if self.margin is not None:

@@ -330,10 +330,7 @@ def _keep_stages(
 
 
 def _fold_targets(maps: Condensed, targets: Targets) -> Condensed:
-    """Return the maps of F_α (α − ᾱ) in place of F_α α, ᾱ(r) the coordinates as if there were no limits.
-
-    Where no limit moves a target, the last term is zero, and F_r r + f is the whole share of the reference.
-    """
+    """Return the maps of F_α (α − ᾱ) in place of F_α α, ᾱ(r) as if there were no limits: zero where none moves it."""
     rows, steps = len(maps.from_target), maps.from_reference.shape[1] // targets.from_reference.shape[1]
     each = maps.from_target.reshape(rows, steps, len(targets.offset))
     from_reference = maps.from_reference + (each @ targets.from_reference).reshape(rows, -1)
