@@ -134,3 +134,7 @@ def in_coordinates(wanted, controller=km.KoopmanMPC):
             return controller(*arguments, **options)
 
     return build
+
+
+def with_disturbances(model, E):
+    return km.LinearPredictor(model.A, model.B, model.C, model.lifting, model.dt, model.states, model.inputs, E=E)

@@ -11,16 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from tests.control.models import PRECISE, Told, in_coordinates, linear, random_pair
+from tests.control.models import PRECISE, Told, in_coordinates, linear, random_pair, with_disturbances
 from tests.control.oracle import oracle
 
 SEEDS = st.integers(0, 2**32 - 1)
 UNSTABLE = np.array([[1.05, 0.1], [0.08, 1.0]]), np.array([[0.005], [0.1]])
 SOLVED = (km.Status.UNCONSTRAINED, km.Status.OPTIMAL, km.Status.SOFTENED)
-
-
-def with_disturbances(model, E):
-    return km.LinearPredictor(model.A, model.B, model.C, model.lifting, model.dt, model.states, model.inputs, E=E)
 
 
 def draw(rng):
@@ -399,61 +395,6 @@ def test_the_coordinates_follow_the_condition_number():
     assert choose(tame, solver="osqp") == "plain"
     assert choose(wild) == "riccati"
     assert choose(tame, solver="daqp") == "riccati"
-
-
-def test_messages():
-    A, B = UNSTABLE
-    model, cost = linear(A, B), km.Cost(1, 0.1)
-    make = lambda *a, **k: km.KoopmanMPC(model, cost, *a, **k)  # noqa: E731
-    driven = km.KoopmanMPC(with_disturbances(model, np.ones((2, 2))), cost, horizon=5)
-    for error, text, call in (
-        (km.errors.DataError, r"moves is 6, the horizon 5; a horizon has at most", lambda: make(horizon=5, moves=6)),
-        (km.errors.DataError, r"moves is 0; it must be at least 1", lambda: make(moves=0)),
-        (km.errors.DataError, r"\(2, 2\) sum to 4, the horizon is 5", lambda: make(horizon=5, moves=(2, 2))),
-        (km.errors.DataError, r"a block of moves is 0; it must be", lambda: make(horizon=5, moves=(5, 0))),
-        (km.errors.DataError, r"w was passed, but the predictor has no E", lambda: make()([0, 0], [0, 0], w=[0])),
-        (
-            km.errors.ShapeError,
-            r"w has shape \(3,\), expected \(2,\), or rows of 2 for steps k … k\+4",
-            lambda: driven([0, 0], [0, 0], w=[0, 0, 0]),
-        ),
-        (
-            km.errors.ShapeError,
-            r"applied has shape \(2,\), expected \(1,\)",
-            lambda: make(km.Limits(du_max=1))([0, 0], [0, 0], [0, 0]),
-        ),
-        (km.errors.DefinitenessError, r"R_delta is indefinite", lambda: km.Cost(1, 1, R_delta=-1)),
-        (
-            km.errors.ShapeError,
-            r"R_delta has shape \(2,\), expected \(1, 1\) or its diagonal",
-            lambda: km.KoopmanMPC(model, km.Cost(1, 1, R_delta=[1, 1])),
-        ),
-        (km.errors.DataError, r"rate limits cross at index 0", lambda: km.Limits(du_min=1, du_max=-1)),
-        (km.errors.DataError, r"du_max is -1.0; an input must be free to stay", lambda: km.Limits(du_max=-1)),
-        (km.errors.DataError, r"du_min is 0.5; an input must be free to stay", lambda: km.Limits(du_min=0.5)),
-        (
-            km.errors.ShapeError,
-            r"slack has a weight of shape \(3,\), expected \(2,\), one a state, then one an output",
-            lambda: make(km.Limits(x_max=1, slack=([1, 1, 1], 1))),
-        ),
-        (
-            km.errors.ShapeError,
-            r"du_slack has a weight of shape \(2,\), expected \(1,\), one an input",
-            lambda: make(km.Limits(du_max=1, du_slack=([1, 1], 1))),
-        ),
-        (
-            km.errors.DataError,
-            r"slack has both weights zero at index 1; give one above zero, or remove the limit",
-            lambda: make(km.Limits(x_max=1, slack=([1, 0], 0))),
-        ),
-        (
-            km.errors.ShapeError,
-            r"E has shape \(3, 1\), expected \(2, any\)",
-            lambda: with_disturbances(model, np.ones((3, 1))),
-        ),
-    ):
-        with pytest.raises(error, match=text):
-            call()
 
 
 @pytest.mark.parametrize(

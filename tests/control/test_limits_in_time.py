@@ -7,7 +7,6 @@ import pytest
 from scipy.signal import StateSpace
 
 import koopmpc as km
-from koopmpc.base.errors import DataError, ShapeError
 from tests.control.models import PRECISE, Told, linear
 from tests.control.oracle import oracle
 
@@ -223,29 +222,29 @@ def test_bad_rows_are_refused_in_sentences_that_name_row_and_step():
     mpc = km.KoopmanMPC(model, COST, good, N)
     falling = np.ones((12, 2))
     falling[7, 1] = -2.0
-    with pytest.raises(DataError, match="input limits cross for index 1 at step 7"):
+    with pytest.raises(km.errors.DataError, match="input limits cross for index 1 at step 7"):
         km.Limits(u_min=-1, u_max=falling)
-    with pytest.raises(ShapeError, match="u_max has 5 rows, the plan reads rows 0 … 7, and row 5 is missing"):
+    with pytest.raises(km.errors.ShapeError, match="u_max has 5 rows, the plan reads rows 0 … 7, and row 5 is missing"):
         mpc([0, 0], [0, 0], limits=good.with_bounds(u_max=np.ones((5, 2))))
     x_max = np.full((12, 2), np.inf)
     x_max[3, 0] = 1.0
-    with pytest.raises(DataError, match=r"x_max limits x0 at step 3.*rows=\(\"x_max\",\)"):
+    with pytest.raises(km.errors.DataError, match=r"x_max limits x0 at step 3.*rows=\(\"x_max\",\)"):
         mpc([0, 0], [0, 0], limits=good.with_bounds(x_max=x_max))
-    with pytest.raises(DataError, match="another slack"):
+    with pytest.raises(km.errors.DataError, match="another slack"):
         mpc([0, 0], [0, 0], limits=km.Limits(u_min=-1, u_max=1, slack=None))
-    with pytest.raises(DataError, match="another levels"):
+    with pytest.raises(km.errors.DataError, match="another levels"):
         mpc([0, 0], [0, 0], limits=km.Limits(u_min=-1, u_max=1, levels=[[-1, 1], None]))
-    with pytest.raises(DataError, match="another priority"):
+    with pytest.raises(km.errors.DataError, match="another priority"):
         mpc([0, 0], [0, 0], limits=km.Limits(u_min=-1, u_max=1, priority={"x0": 1}))
-    with pytest.raises(DataError, match="no bound v_max"):
+    with pytest.raises(km.errors.DataError, match="no bound v_max"):
         good.with_bounds(v_max=3)
-    with pytest.raises(DataError, match="pass a tuple of u_min"):
+    with pytest.raises(km.errors.DataError, match="pass a tuple of u_min"):
         km.Limits(rows=("theta",))
     low, high = np.tile([-1.0], (12, 1)), np.tile([-0.5], (12, 1))
     low[4:], high[4:] = 0.0, 0.5
-    with pytest.raises(DataError, match="within a block of 7 held steps"):
+    with pytest.raises(km.errors.DataError, match="within a block of 7 held steps"):
         km.KoopmanMPC(model, COST, km.Limits(u_min=low, u_max=high), N, moves=(1, 7))
-    with pytest.raises(DataError, match="cross for"):
+    with pytest.raises(km.errors.DataError, match="cross for"):
         km.LQR(model, COST, km.Limits(u_min=-1, u_max=falling - 3))
     assert mpc([0.1, 0], [0, 0]).status.value < 4  # a refused call leaves the controller as it was
 
@@ -267,7 +266,7 @@ def test_laws_without_a_plan_clip_each_input_to_the_row_of_its_step(rates):
                 u = float(law([0.0], [1.0]).u[0])
                 assert u == min(np.clip(wished, last - change, last + change), high[min(k, 5), 0])
                 last = u
-    with pytest.raises(DataError, match="rows in time"):
+    with pytest.raises(km.errors.DataError, match="rows in time"):
         km.compiled(km.LQR(model, cost, limits))
 
 
@@ -277,7 +276,7 @@ def test_limits_by_name_that_cross_name_signal_and_step():
         ({"u_min": {"u1": 1.5}, "u_max": {"u1": rows}}, "input limits cross for u1 at step 10: lower 1.5 is above"),
         ({"x_min": {"x1": 1.5}, "x_max": {"x1": 1.0}}, "state limits cross for x1: lower 1.5 is above upper 1"),
     ):
-        with pytest.raises(DataError, match=said):
+        with pytest.raises(km.errors.DataError, match=said):
             km.KoopmanMPC(linear(A, B), COST, km.Limits(**ends), N)
 
 
@@ -315,10 +314,10 @@ def test_levels_keep_to_those_inside_the_rows_and_maintenance_stops_a_pump():
     np.testing.assert_array_equal(own, rows)
     u_max[8, 0], low = 0.4, np.zeros((T, 2))
     low[8, 0] = 0.1
-    with pytest.raises(DataError, match=r"no level of u0 is between its limits 0\.1 … 0\.4 at step 8"):
+    with pytest.raises(km.errors.DataError, match=r"no level of u0 is between its limits 0\.1 … 0\.4 at step 8"):
         km.KoopmanMPC(model, COST, limits.with_bounds(u_min=low, u_max=u_max), N)
     for kind in (km.BilinearMPC, km.NonlinearMPC):
-        with pytest.raises(DataError, match=r"no level of u0 is between its limits 0\.1 … 0\.4 at step 8"):
+        with pytest.raises(km.errors.DataError, match=r"no level of u0 is between its limits 0\.1 … 0\.4 at step 8"):
             kind(model, COST, limits.with_bounds(u_min=low, u_max=u_max), N)
 
 
@@ -392,7 +391,7 @@ def test_further_calls_with_new_limits_are_those_of_a_controller_that_meets_them
         fresh.reset(u_prev=np.zeros(2) if k == 0 else move.u)
         if k == 7:
             for each in (old, fresh):
-                with pytest.raises(DataError, match="x_max limits b at step 0"):
+                with pytest.raises(km.errors.DataError, match="x_max limits b at step 0"):
                     each(x, r, limits=own)
             break
         move, first = old(x, r, limits=own), fresh(x, r, limits=own)

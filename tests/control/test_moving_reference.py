@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.base.errors import ShapeError
 from tests.control.models import linear
 
 A, B = np.array([[1.0, 0.1], [0.15, 0.98]]), np.array([[0.005], [0.1]])
@@ -61,7 +60,7 @@ def test_a_reference_that_is_refused_leaves_the_last_one_as_it_was(kind):
     mpc([0, 0], preview("one row", 1))
     mpc([0, 0], last)
     for refused in (np.zeros(3), np.zeros((4, 3))):
-        with pytest.raises(ShapeError, match="reference has shape"):
+        with pytest.raises(km.errors.ShapeError, match="reference has shape"):
             mpc([0, 0], refused)
         np.testing.assert_allclose(mpc([0, 0], last).u, fresh([0, 0], last).u, rtol=0, atol=1e-12)
 

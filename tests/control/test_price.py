@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.base.errors import DataError
 from tests.control.models import linear
 from tests.control.oracle import targets_of, weighed
 
@@ -144,12 +143,12 @@ def test_prices_by_name_and_what_is_refused():
     model = linear(A, B)
     named = km.Cost(Q=1, R=R, price={"u1": [0.1, 0.2]}).resolve(model.states, model.inputs)
     assert np.array_equal(named.price, [[0, 0.1], [0, 0.2]])
-    with pytest.raises(DataError, match="R above zero"):
+    with pytest.raises(km.errors.DataError, match="R above zero"):
         km.KoopmanMPC(model, km.Cost(Q=[1, 1], R=[1, 0], price=[0, 1]), LIMITS, N)
-    with pytest.raises(DataError, match="does not know"):
+    with pytest.raises(km.errors.DataError, match="does not know"):
         km.LQR(model, km.Cost(Q=[1, 1], R=R, price=[0, 1]))
     for price in ([np.inf, 0], {"u0": [0, np.nan]}):
-        with pytest.raises(DataError, match="price holds 1 NaN or inf, the first at"):
+        with pytest.raises(km.errors.DataError, match="price holds 1 NaN or inf, the first at"):
             km.Cost(Q=1, R=R, price=price)
     for wrong, said in (
         ({"output_price": [1, 0], "Q": [0, 1]}, "no weight in Q"),
@@ -157,11 +156,11 @@ def test_prices_by_name_and_what_is_refused():
         ({"output_price": [[1, 0]]}, "a number for each tracked output"),
         ({"output_price": {"x7": 1}}, "x7"),
     ):
-        with pytest.raises((DataError, km.errors.ShapeError), match=said):
+        with pytest.raises((km.errors.DataError, km.errors.ShapeError), match=said):
             km.KoopmanMPC(model, km.Cost(**{"Q": [1, 1], "R": R, **wrong}), LIMITS, N)
-    with pytest.raises(DataError, match="paid back by Q"):
+    with pytest.raises(km.errors.DataError, match="paid back by Q"):
         km.Cost(Q=1, R=R, Q_rows=[[1, 1]], output_price=[1, 0])
-    with pytest.raises(DataError, match="does not know"):
+    with pytest.raises(km.errors.DataError, match="does not know"):
         km.LQR(model, km.Cost(Q=[1, 1], R=R, output_price=[0, 1]))
     with pytest.raises(km.errors.DataError, match="price"):
         km.BilinearMPC(model, km.Cost(Q=[1, 1], R=R, price=[0, 1]), LIMITS, N).build_program(None)

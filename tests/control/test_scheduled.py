@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.base.errors import DataError, ShapeError
 
 DT = 0.1
 A = np.array([[0.95, 0.1], [-0.1, 0.9]])
@@ -56,7 +55,7 @@ def test_forecasts_follow_w_and_files_keep_it(model, rank, tmp_path):
     if rank is None:
         held = own.rollout(episode.X[0], episode.U, np.full((40, 1), 0.4))
         np.testing.assert_allclose(own.at([0.4]).rollout(episode.X[0], episode.U), held, atol=1e-9)
-    with pytest.raises(ShapeError, match="W has shape"):
+    with pytest.raises(km.errors.ShapeError, match="W has shape"):
         own.rollout(episode.X[0], episode.U, np.zeros((40, 2)))
 
 
@@ -142,12 +141,12 @@ def test_a_run_repeats_to_the_bit_and_copies_go_on(model):
 
 def test_w_that_does_not_fit_is_refused(model):
     mpc = km.BilinearMPC(model, km.Cost(Q=[1, 0], R=0.01), km.Limits(-2, 2), 6)
-    with pytest.raises(ShapeError, match="w has shape"):
+    with pytest.raises(km.errors.ShapeError, match="w has shape"):
         mpc([0, 0], [0, 0], w=[1.0, 2.0])
     assert mpc([0, 0], [0, 0], w=[np.nan]).status is km.Status.BAD_MEASUREMENT
     W = np.zeros((20, 1))
     W[3] = np.nan
-    with pytest.raises(DataError, match="W"):
+    with pytest.raises(km.errors.DataError, match="W"):
         km.Episode(X=np.zeros((21, 2)), U=np.zeros((20, 1)), W=W)
-    with pytest.raises(DataError, match="Constant"):
+    with pytest.raises(km.errors.DataError, match="Constant"):
         km.BilinearPredictor(A, B, N1[None], np.eye(2), km.State(), DT, ("a", "b"), ("u",), E=E).at([1.0])

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.base.errors import DataError, ShapeError
 from tests.control.models import linear
 from tests.control.oracle import oracle
 from tests.control.test_limits_in_time import REFERENCES, constant, moving_limits
@@ -84,19 +83,19 @@ def test_a_call_that_is_refused_counts_as_no_step(kind):
     u_max = np.linspace(1.0, 0.05, 20)[:, None] * np.ones(2)
     mpc, twin = (kind(linear(A, B), cost(), km.Limits(u_min=-u_max, u_max=u_max), N) for _ in range(2))
     for _ in range(3):
-        with pytest.raises(ShapeError):
+        with pytest.raises(km.errors.ShapeError):
             mpc([0.0, 0.0, 0.0], [2.0, 2.0])
         assert (mpc([-2.0, -2.0], [2.0, 2.0]).u == twin([-2.0, -2.0], [2.0, 2.0]).u).all()
 
 
 def test_what_the_stages_do_not_have_is_refused():
     model, rows = linear(A, B), np.ones((20, 2))
-    with pytest.raises(DataError, match="du_max has rows"):
+    with pytest.raises(km.errors.DataError, match="du_max has rows"):
         km.BilinearMPC(model, cost(), km.Limits(-1, 1, du_max=rows), N)
-    with pytest.raises(DataError, match="moves that are held"):
+    with pytest.raises(km.errors.DataError, match="moves that are held"):
         km.BilinearMPC(model, cost(), km.Limits(-1, rows), N, moves=3)
     mpc = km.BilinearMPC(model, cost(), km.Limits(-1, 1), N)
-    with pytest.raises(DataError, match="upper limit at step 0"):
+    with pytest.raises(km.errors.DataError, match="upper limit at step 0"):
         mpc([0, 0], [0, 0], limits=mpc.limits.with_bounds(x_max=1.0))
 
 

@@ -8,7 +8,6 @@ import pytest
 import scipy.linalg
 
 import koopmpc as km
-from koopmpc.base.errors import DataError
 from koopmpc.control.solvers import order, piqp
 
 pytest.importorskip("piqp", reason="an extra")
@@ -112,18 +111,18 @@ def test_without_its_extra_it_is_refused_and_auto_does_without(monkeypatch):
     for module in (piqp, order):
         monkeypatch.setattr(module, "has_piqp", lambda: False)
     assert controller("auto", 60)([3.0, 0.0, 0.0, 0.0], np.zeros(4)).solver == "daqp"
-    with pytest.raises(DataError, match=r'pip install "koopmpc\[piqp\]"'):
+    with pytest.raises(km.errors.DataError, match=r'pip install "koopmpc\[piqp\]"'):
         controller("piqp", 60)
 
 
 def test_a_setting_that_it_does_not_have_is_refused():
     model = km.LinearPredictor(A, B[:, :1], np.eye(4), km.State(), 0.1, tuple("abcd"), ("u",))
-    with pytest.raises(DataError, match="PIQP has no setting 'rho'"):
+    with pytest.raises(km.errors.DataError, match="PIQP has no setting 'rho'"):
         km.KoopmanMPC(model, km.Cost(np.ones(4), 0.1), km.Limits(-1, 1), 5, solver="piqp", settings={"rho": 1.0})
 
 
 @pytest.mark.parametrize("value", [-1.0, np.nan])
 def test_a_setting_that_is_no_positive_number_is_refused(value):
     model = km.LinearPredictor(A, B[:, :1], np.eye(4), km.State(), 0.1, tuple("abcd"), ("u",))
-    with pytest.raises(DataError, match="PIQP's setting eps_abs"):
+    with pytest.raises(km.errors.DataError, match="PIQP's setting eps_abs"):
         km.KoopmanMPC(model, km.Cost(np.ones(4), 0.1), km.Limits(-1, 1), 5, solver="piqp", settings={"eps_abs": value})
