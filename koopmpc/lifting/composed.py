@@ -62,20 +62,7 @@ class Projected(Lifting):
 
 @dataclass(frozen=True, eq=False)
 class Picked(Lifting):
-    """ψ(x) = the observables of another lifting at the indices `which`, with their names; no other one is computed.
-
-    Parameters
-    ----------
-    lifting
-        The lifting that holds the observables.
-    which
-        Indices of the observables to keep.
-
-    Raises
-    ------
-    DataError
-        An index is not below the number of observables.
-    """
+    """ψ(x) = the observables of another lifting at the indices `which`, with their names; no other one is computed."""
 
     lifting: Lifting
     which: tuple[int, ...]
@@ -98,18 +85,7 @@ class Picked(Lifting):
 
 @dataclass(frozen=True, eq=False)
 class Present(Lifting):
-    """ψ(ζ) = ψ(x) for a point ζ = [x; u_{k−1}; x_{k−1}; …] of delays: the observables of the present state x.
-
-    Parameters
-    ----------
-    lifting
-        ψ, bound to the names of x.
-
-    Raises
-    ------
-    ShapeError
-        ζ does not begin with these states.
-    """
+    """ψ(ζ) = ψ(x) for a point ζ = [x; u_{k−1}; x_{k−1}; …] of delays: the observables of the present state x."""
 
     lifting: Lifting
 

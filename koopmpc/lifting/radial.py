@@ -159,15 +159,7 @@ class ThinPlate(Lifting):
 
 @dataclass(frozen=True, eq=False, init=False)
 class PolynomialKernel(Lifting):
-    """ψ(x) = (1 + xᵀc)^degree for each centre c; with enough centres they span all monomials up to the degree.
-
-    Parameters
-    ----------
-    centers
-        (nc, nx), one centre a row.
-    degree
-        At least 1.
-    """
+    """ψ(x) = (1 + xᵀc)^degree for each centre c; with enough centres they span all monomials up to the degree."""
 
     tunable: ClassVar[Mapping[str, str]] = {"centers": "real"}
     centers: Float[np.ndarray, "nc nx"]

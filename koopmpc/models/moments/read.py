@@ -140,26 +140,15 @@ class _Sums(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _ReadTask:
-    """A task for a worker: sum the rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)] of one part.
+    """A task for a worker: sum the rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)] of one part."""
 
-    Attributes
-    ----------
-    part
-        The part that holds the episodes; None in a template of tasks.
-    lifting, inputs, bilinear
-        They define the rows. The bound ψ crosses processes as data, so that a user's own lifting can.
-    weights
-        Weights of the steps; None weighs all by 1.
-    route
-        "gram" for Σ w dᵀd, "qr" for its triangular factor.
-    """
-
-    part: Part | None
+    part: Part | None  # the part that holds the episodes; None in a template of tasks
+    # they define the rows. The bound ψ crosses processes as data, so that a user's own lifting can
     lifting: Lifting
     inputs: tuple[str, ...]
     bilinear: bool
-    weights: Weights | None
-    route: Route = "gram"
+    weights: Weights | None  # weights of the steps; None weighs all by 1
+    route: Route = "gram"  # "gram" for Σ w dᵀd, "qr" for its triangular factor
 
     def __str__(self) -> str:
         return str(self.part)

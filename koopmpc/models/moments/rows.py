@@ -22,27 +22,14 @@ Table = Float[np.ndarray, "m nd"]
 
 @dataclass(frozen=True, eq=False)
 class RowColumns:
-    """The columns of the rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)], where the states that ψ lacks are appended to ψ(x).
+    """The columns of the rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)], where the states that ψ lacks are appended to ψ(x)."""
 
-    Attributes
-    ----------
-    full
-        ψ, then the states that it lacks.
-    products
-        Indices of the observables in u⊗ψ(x): all without the Constant, because u · 1 is u; empty if not bilinear.
-    names
-        Name of each column.
-    regressors
-        The columns of ψ(x), u and u⊗ψ(x).
-    targets
-        The columns of ψ(x⁺), the appended states last.
-    """
-
-    full: Lifting
+    full: Lifting  # ψ, then the states that it lacks
+    # indices of the observables in u⊗ψ(x): all without the Constant, because u · 1 is u; empty if not bilinear
     products: Int[np.ndarray, " np"]
-    names: tuple[str, ...]
-    regressors: Int[np.ndarray, " n"]
-    targets: Int[np.ndarray, " m"]
+    names: tuple[str, ...]  # name of each column
+    regressors: Int[np.ndarray, " n"]  # the columns of ψ(x), u and u⊗ψ(x)
+    targets: Int[np.ndarray, " m"]  # the columns of ψ(x⁺), the appended states last
 
 
 def row_columns(lifting: Lifting, inputs: tuple[str, ...], bilinear: bool) -> RowColumns:
@@ -83,25 +70,14 @@ def split_chunks(episodes: Episodes, rows: int = ROWS) -> list[list[Piece]]:
 
 
 class LiftedChunk(NamedTuple):
-    """The rows p = [ψ(x) u u⊗ψ(x)] of a chunk, one row for each state; u = 0 in the last row of a piece.
+    """The rows p = [ψ(x) u u⊗ψ(x)] of a chunk, one row for each state; u = 0 in the last row of a piece."""
 
-    Attributes
-    ----------
-    P
-        The rows of all pieces, one piece after the other.
-    first, last
-        Indices of the first and the last row of each piece. Such a row is part of one pair, any other of two.
-    nz
-        Number of observables.
-    weights
-        w of each pair; None weighs all by 1.
-    """
-
-    P: Float[np.ndarray, "m n"]
+    P: Float[np.ndarray, "m n"]  # the rows of all pieces, one piece after the other
+    # indices of the first and the last row of each piece. Such a row is part of one pair, any other of two
     first: Int[np.ndarray, " k"]
     last: Int[np.ndarray, " k"]
-    nz: int
-    weights: Float[np.ndarray, " M"] | None = None
+    nz: int  # number of observables
+    weights: Float[np.ndarray, " M"] | None = None  # w of each pair; None weighs all by 1
 
     def pairs(self) -> Float[np.ndarray, "M nd"]:
         """Return the rows [p ψ(x⁺)] of the pairs, each times the root of its weight."""

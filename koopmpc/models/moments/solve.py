@@ -38,27 +38,14 @@ def check_ridge(value: object) -> Ridge:
 
 @dataclass(frozen=True, eq=False)
 class RegressionRows:
-    """Rows [P T] with the second moments of M snapshots.
+    """Rows [P T] with the second moments of M snapshots."""
 
-    Attributes
-    ----------
-    P
-        (m, n) regressors.
-    T
-        (m, nt) targets.
-    rest
-        (nt,) energy Σt² of the part of each target that is not in these rows; no K can fit it.
-    samples
-        The number M of snapshots.
-    constant
-        The column of P that is 1 in every snapshot, or None.
-    """
-
-    P: Float[np.ndarray, "m n"]
-    T: Float[np.ndarray, "m nt"]
+    P: Float[np.ndarray, "m n"]  # (m, n) regressors
+    T: Float[np.ndarray, "m nt"]  # (m, nt) targets
+    # (nt,) energy Σt² of the part of each target that is not in these rows; no K can fit it
     rest: Float[np.ndarray, " nt"]
-    samples: int
-    constant: int | None = None
+    samples: int  # the number M of snapshots
+    constant: int | None = None  # the column of P that is 1 in every snapshot, or None
 
     def residual(self, columns: Int[np.ndarray, " c"], K: Float[np.ndarray, "n c"]) -> Float[np.ndarray, " c"]:
         """Return the root-mean-square of T − P K for these columns of T."""

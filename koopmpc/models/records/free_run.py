@@ -17,18 +17,12 @@ HELD = 3.0  # a free run has diverged if it leaves this many times the range of 
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Stretches of records as deviations from the mean, in standard deviations.
+    """Stretches of records as deviations from the mean, in standard deviations."""
 
-    Attributes
-    ----------
-    Y, U
-        States (rows + 1, nx) and inputs (rows, nu) of each piece.
-    mean, scale
-        Of [x u]; the scale of a signal that does not move is 1.
-    """
-
+    # states (rows + 1, nx) and inputs (rows, nu) of each piece
     Y: tuple[np.ndarray, ...]
     U: tuple[np.ndarray, ...]
+    # of [x u]; the scale of a signal that does not move is 1
     mean: Float[np.ndarray, " nv"]
     scale: Float[np.ndarray, " nv"]
 

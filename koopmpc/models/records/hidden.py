@@ -17,24 +17,16 @@ class HiddenModel:
     """z⁺ = E φ(z, u), y = H [z; 1] and z = T [ζ; 1], φ = [1; products; u times products; tanh(V [z; 1])].
 
     All signals are deviations from their means, in standard deviations.
-
-    Attributes
-    ----------
-    terms
-        The factors of each product as indices of [1, z, u], from 1, padded with 0.
-    E, H, T
-        (n, 1 + terms + q), (ny, n + 1) and (n, nζ + 1).
-    bound
-        (n,) in terms with two factors of z or more, |z| counts as this at most: outside of the data they are constant.
-    V
-        (q, n + 1) slopes and offsets of the neurons tanh(V [z; 1]); None without any.
     """
 
-    terms: Terms
+    terms: Terms  # the factors of each product as indices of [1, z, u], from 1, padded with 0
+    # (n, 1 + terms + q), (ny, n + 1) and (n, nζ + 1)
     E: Float[np.ndarray, "n nphi"]
     H: Float[np.ndarray, "ny n1"]
     T: Float[np.ndarray, "n nzeta1"]
+    # (n,) in terms with two factors of z or more, |z| counts as this at most: outside of the data they are constant
     bound: Float[np.ndarray, " n"]
+    # (q, n + 1) slopes and offsets of the neurons tanh(V [z; 1]); None without any
     V: Float[np.ndarray, "q n1"] | None = None
 
     @property

@@ -43,33 +43,21 @@ from koopmpc.models.shared.levenberg_marquardt import PATIENCE, minimise
 
 @dataclass(frozen=True)
 class HiddenSettings:
-    """How much a fit of a hidden state learns from, and how long it goes on.
+    """How much a fit of a hidden state learns from, and how long it goes on."""
 
-    Attributes
-    ----------
-    rows, piece
-        Rows that it learns from, at most: of longer records evenly spread pieces of `piece` rows are taken.
-    steps, quick_steps
-        Steps of all segments of one length, about; in a search of many sizes.
-    effort
-        Levenberg-Marquardt steps of a stage, steps in a row that do not gain on unseen rows, and the share of the
-        squared error below which a step is the last.
-    polish
-        Steps on all rows at the end, and how many in a row may not gain.
-    gained
-        Try a larger order only if the last one lowered the error to less than this share.
-    contained
-        Hold the eigenvalues of the linear part inside the unit circle, judge calmness from other states too, and begin
-        with differences of the outputs where these forecast better than `subspace`.
-    """
-
+    # rows that it learns from, at most: of longer records evenly spread pieces of `piece` rows are taken
     rows: int
     piece: int
+    # steps of all segments of one length, about; in a search of many sizes
     steps: int
     quick_steps: int
+    # Levenberg-Marquardt steps of a stage, steps in a row that do not gain on unseen rows, and the share of the squared
+    # error below which a step is the last
     effort: tuple[int, int, float]
-    polish: tuple[int, int]
-    gained: float
+    polish: tuple[int, int]  # steps on all rows at the end, and how many in a row may not gain
+    gained: float  # try a larger order only if the last one lowered the error to less than this share
+    # hold the eigenvalues of the linear part inside the unit circle, judge calmness from other states too, and begin
+    # with differences of the outputs where these forecast better than `subspace`
     contained: bool
 
 

@@ -28,39 +28,23 @@ _STARTS = 8  # rows of each record at which it begins
 
 @dataclass(frozen=True, eq=False)
 class HiddenStructure(Value):
-    """The sizes of a polynomial state-space model, and its errors on unseen rows.
+    """The sizes of a polynomial state-space model, and its errors on unseen rows."""
 
-    Attributes
-    ----------
-    order, degree
-        Order of the hidden state, and total degree of the polynomials.
-    delays, horizon
-        Past rows from which the state begins, and steps of the segments that the fit forecasts; 0 where `subspace` is
-        taken as it is.
-    rails
-        (2, ny) the least and the largest reading of each sensor; None where none saturates.
-    errors
-        (blocks,) errors in spreads of free runs and forecasts on the last quarter of each record.
-    calm
-        It stays within three times the range of the data, in free run over each record twice.
-    parameters
-        Number of coefficients.
-    neurons
-        Number of neurons in the dynamics.
-    start
-        Which of the starts for neurons it was.
-    """
-
+    # order of the hidden state, and total degree of the polynomials
     order: int
     degree: int
+    # past rows from which the state begins, and steps of the segments that the fit forecasts; 0 where `subspace` is
+    # taken as it is
     delays: int
     horizon: int
+    # (2, ny) the least and the largest reading of each sensor; None where none saturates
     rails: Float[np.ndarray, "2 ny"] | None
+    # (blocks,) errors in spreads of free runs and forecasts on the last quarter of each record
     errors: Float[np.ndarray, " blocks"]
-    calm: bool
-    parameters: int
-    neurons: int = 0
-    start: int = 0
+    calm: bool  # it stays within three times the range of the data, in free run over each record twice
+    parameters: int  # number of coefficients
+    neurons: int = 0  # number of neurons in the dynamics
+    start: int = 0  # which of the starts for neurons it was
 
     @property
     def error(self) -> float:

@@ -45,37 +45,24 @@ def find_forecast_horizon(episodes: Episodes) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Structure(Value):
-    """Terms of a polynomial model in standard units, for each state, and its errors on unseen rows.
+    """Terms of a polynomial model in standard units, for each state, and its errors on unseen rows."""
 
-    Attributes
-    ----------
-    delays, degree
-        Past rows in ζ, and the total degree that terms may have.
-    terms
-        For each state the indices of its terms' factors in [1, ζ, u], padded with 0.
-    mean, scale
-        (nx + nu,) of [x u]: a variable v stands for (v − mean) / scale.
-    errors
-        (blocks,) errors in spreads, of free runs and forecasts alike, on blocks of rows that neither the choice of the
-        terms nor their coefficients saw.
-    calm
-        Fitted to all rows it stays within three times the range of the data, in free run over each record twice.
-    rails
-        (2, nx) the least and the largest reading of each sensor; None where none saturates. No row whose target is at
-        a rail is learned from.
-    masked
-        Rows whose past holds a reading at a rail are left out too.
-    """
-
+    # past rows in ζ, and the total degree that terms may have
     delays: int
     degree: int
-    terms: tuple[Terms, ...]
+    terms: tuple[Terms, ...]  # for each state the indices of its terms' factors in [1, ζ, u], padded with 0
+    # (nx + nu,) of [x u]: a variable v stands for (v − mean) / scale
     mean: Float[np.ndarray, " nv"]
     scale: Float[np.ndarray, " nv"]
+    # (blocks,) errors in spreads, of free runs and forecasts alike, on blocks of rows that neither the choice of the
+    # terms nor their coefficients saw
     errors: Float[np.ndarray, " blocks"]
+    # fitted to all rows it stays within three times the range of the data, in free run over each record twice
     calm: bool
+    # (2, nx) the least and the largest reading of each sensor; None where none saturates. No row whose target is at a
+    # rail is learned from
     rails: Float[np.ndarray, "2 nx"] | None = None
-    masked: bool = False
+    masked: bool = False  # rows whose past holds a reading at a rail are left out too
 
     @property
     def size(self) -> int:

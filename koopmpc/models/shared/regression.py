@@ -29,44 +29,25 @@ _HALF = float(
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """The regression of ψ(x⁺) on [ψ(x) u], before it is solved.
+    """The regression of ψ(x⁺) on [ψ(x) u], before it is solved."""
 
-    Attributes
-    ----------
-    method, route
-        Name of the fit, and how the data were read, as in the report.
-    rows
-        P = [ψ(x) u]; T begins with ψ(x⁺).
-    x_next
-        The columns of T that hold x⁺.
-    lifting, states, inputs, dt
-        As in the predictor.
-    C, state_residual
-        (nx, nz), or None if ψ(x) is x; and the root-mean-square of x − C ψ(x).
-    disturbances
-        Names of the measured disturbances w, the last of the inputs.
-    B
-        (nz, nu) if it is known; None if it is fitted.
-    scaled
-        True if the regression is solved on columns of unit norm.
-    embedding
-        As in the predictor.
-    """
-
+    # name of the fit, and how the data were read, as in the report
     method: str
     route: str
-    rows: RegressionRows
-    x_next: Int[np.ndarray, " nx"]
+    rows: RegressionRows  # P = [ψ(x) u]; T begins with ψ(x⁺)
+    x_next: Int[np.ndarray, " nx"]  # the columns of T that hold x⁺
+    # as in the predictor
     lifting: Lifting
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     dt: float
+    # (nx, nz), or None if ψ(x) is x; and the root-mean-square of x − C ψ(x)
     C: Float[np.ndarray, "nx nz"] | None
     state_residual: Float[np.ndarray, " nx"]
-    B: Float[np.ndarray, "nz nu"] | None = None
-    scaled: bool = True
-    embedding: Delay | None = None
-    disturbances: tuple[str, ...] = ()
+    B: Float[np.ndarray, "nz nu"] | None = None  # (nz, nu) if it is known; None if it is fitted
+    scaled: bool = True  # true if the regression is solved on columns of unit norm
+    embedding: Delay | None = None  # as in the predictor
+    disturbances: tuple[str, ...] = ()  # names of the measured disturbances w, the last of the inputs
 
     @property
     def columns(self) -> int:
@@ -134,32 +115,18 @@ def build_regression(
 
 
 class FitNotes(TypedDict, total=False):
-    """What a fit tells its report.
+    """What a fit tells its report."""
 
-    Attributes
-    ----------
-    rule
-        How the regression was solved, in words.
-    rank, condition
-        Those of the regressors; computed if they are left out.
-    columns
-        Number of regressors, if it is not that of the rows.
-    ridge
-        The Tikhonov weight.
-    doubts, changes
-        Sentences of the report: its warnings, and the changes by a prior, a limit or a penalty.
-    silent
-        Raise no warning.
-    """
-
-    rule: Required[str]
+    rule: Required[str]  # how the regression was solved, in words
+    # those of the regressors; computed if they are left out
     rank: int
     condition: float
-    columns: int
-    ridge: float
+    columns: int  # number of regressors, if it is not that of the rows
+    ridge: float  # the Tikhonov weight
+    # sentences of the report: its warnings, and the changes by a prior, a limit or a penalty
     doubts: Sequence[str]
     changes: Sequence[str]
-    silent: bool
+    silent: bool  # raise no warning
 
 
 def build_report(regression: Regression, K: Float[np.ndarray, "n nz"], notes: FitNotes) -> FitReport:
