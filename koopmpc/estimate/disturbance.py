@@ -121,24 +121,12 @@ class LiftedDisturbance(Value):
 
 @dataclass(frozen=True, eq=False)
 class DisturbanceProgram(EstimatorProgram):
-    """z = ψ(ζ), and d by the rule of `LiftedDisturbance`.
+    """z = ψ(ζ), and d by the rule of `LiftedDisturbance`."""
 
-    Attributes
-    ----------
-    gain
-        Weight of the newest misfit.
-    reach
-        Steps over which a misfit must hardly change to be taken as it is; 0 where a mean is always taken.
-    known
-        (nz,) the entries of z that have no disturbance.
-    C
-        (ny, nz) z → states.
-    """
-
-    gain: float
-    reach: float
-    known: Bool[np.ndarray, " nz"]
-    C: Float[np.ndarray, "ny nz"]
+    gain: float  # weight of the newest misfit
+    reach: float  # steps over which a misfit must hardly change to be taken as it is; 0 where a mean is always taken
+    known: Bool[np.ndarray, " nz"]  # (nz,) the entries of z that have no disturbance
+    C: Float[np.ndarray, "ny nz"]  # (ny, nz) z → states
 
 
 class DisturbanceObserver(Viewing, Measured):

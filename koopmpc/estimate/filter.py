@@ -96,26 +96,9 @@ FilterModel = tuple[Augmented, Float[np.ndarray, "n n"], Float[np.ndarray, "ny n
 
 @dataclass(frozen=True, eq=False)
 class FilterProgram(EstimatorProgram):
-    """s⁺ = F s + G [u; w] + f; s ← s + P Mᵀ(M P Mᵀ + R)⁻¹(y − M s − h); z = to_z s + one, d = to_d s.
+    """s⁺ = F s + G [u; w] + f; s ← s + P Mᵀ(M P Mᵀ + R)⁻¹(y − M s − h); z = to_z s + one, d = to_d s."""
 
-    Attributes
-    ----------
-    F, G, f, M, h, to_z, one, to_d
-        See `Augmented`.
-    P, R
-        Covariances of s before a measurement, and of the noise of y. Entries of y that are NaN are left out.
-    kept
-        The entries of z at a known start with which s begins; d begins at zero.
-    delay, patience
-        Steps that y is old; samples in sequence without any measurement that are bridged.
-    held
-        Entries at the end of s that are the input of the step before: nu with feedthrough, else 0.
-    rests
-        Where no start is given, s begins as if the plant had rested at the first y.
-    shows
-        y are the states of the model: an estimate that is lost begins again as if the plant had rested at y.
-    """
-
+    # see `Augmented`
     F: Float[np.ndarray, "ns ns"]
     G: Float[np.ndarray, "ns nuw"]
     f: Float[np.ndarray, " ns"]
@@ -124,13 +107,16 @@ class FilterProgram(EstimatorProgram):
     to_z: Float[np.ndarray, "nz ns"]
     one: Float[np.ndarray, " nz"]
     to_d: Float[np.ndarray, "nz ns"]
+    # covariances of s before a measurement, and of the noise of y. Entries of y that are NaN are left out
     P: Float[np.ndarray, "ns ns"]
     R: Float[np.ndarray, "ny ny"]
-    kept: Int[np.ndarray, " kept"]
+    kept: Int[np.ndarray, " kept"]  # the entries of z at a known start with which s begins; d begins at zero
+    # steps that y is old; samples in sequence without any measurement that are bridged
     delay: int
     patience: int
-    held: int = 0
-    rests: bool = False
+    held: int = 0  # entries at the end of s that are the input of the step before: nu with feedthrough, else 0
+    rests: bool = False  # where no start is given, s begins as if the plant had rested at the first y
+    # y are the states of the model: an estimate that is lost begins again as if the plant had rested at y
     shows: bool = False
 
 

@@ -152,13 +152,9 @@ class EstimatorProgram(Value):
     """The data with which an observer finds z and d of y. As it stands: z = ψ(ζ), ζ of the measured y, and d = 0.
 
     The other kinds are `DisturbanceProgram` and `FilterProgram`.
-
-    Attributes
-    ----------
-    gate
-        Which readings are refused, see `koopmpc.estimate.gate`; None where an observer remembers no reading.
     """
 
+    # which readings are refused, see `koopmpc.estimate.gate`; None where an observer remembers no reading
     gate: Graph | None = field(default=None, kw_only=True)
 
 
