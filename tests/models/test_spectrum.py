@@ -191,3 +191,15 @@ def test_the_error_over_an_evolution_is_that_of_its_definition() -> None:
     gaps = [phi - phi[0] * model.eigenvalues ** np.arange(len(phi))[:, None] for phi in phis]
     missed, size = (np.linalg.norm(np.vstack(some), axis=0) for some in (gaps, phis))
     np.testing.assert_allclose(km.spectrum.evolution_error(model, data), missed / size)
+
+
+@given(st.floats(0.2, 1.0), st.floats(0.1, 3.0), st.integers(2, 40))
+def test_an_evolution_on_an_invariant_subspace_has_no_error(rho: float, turn: float, steps: int) -> None:
+    A = rho * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    X = np.array([np.linalg.matrix_power(A, k) @ [1.0, 0.3] for k in range(steps + 1)])
+    model = km.LinearPredictor(A, np.zeros((2, 0)), np.eye(2), km.State(), 0.1, ("x0", "x1"), ())
+    data = km.Episodes([km.Episode(X=X)], 0.1)
+    assert km.spectrum.evolution_error(model, data).max() < 1e-9
+    driven = km.LinearPredictor(A, np.ones((2, 1)), np.eye(2), km.State(), 0.1, data.states, ("u0",))
+    with pytest.raises(km.errors.DataError, match=r"the predictor has inputs, .* pass an autonomous fit"):
+        km.spectrum.evolution_error(driven, data)

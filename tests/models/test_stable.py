@@ -1,5 +1,7 @@
 """Stable fits: stable, unmoved where nothing has to move, closer than clipping, convex optimum where that is known."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -107,30 +109,20 @@ def test_the_ridge_of_cross_validation_is_that_of_the_plain_fit() -> None:
     data = runs(1, 3, 1, radius=1.05, noise=0.3)
     plain = km.edmd(data, km.State(), ridge="gcv")
     assert plain.report.ridge > 0
-    free = km.identify.Prior(mask_A=[[1, 1, 0], [1, 1, 1], [1, 1, 1]])
+    free, none = km.identify.Prior(mask_A=[[1, 1, 0], [1, 1, 1], [1, 1, 1]]), km.identify.Prior()
+    stable = partial(km.identify.stable_edmd, data, km.State())
+    constrained = partial(km.identify.constrained_edmd, data, km.State())
     for model, same in (
-        (
-            km.identify.stable_edmd(data, km.State(), ridge="gcv", radius=5.0),
-            km.identify.stable_edmd(data, km.State(), radius=5.0),
-        ),
-        (
-            km.identify.stable_edmd(data, km.State(), ridge="gcv", radius=0.5),
-            km.identify.stable_edmd(data, km.State(), radius=0.5),
-        ),
-        (
-            km.identify.constrained_edmd(data, km.State(), prior=km.identify.Prior(), ridge="gcv"),
-            km.edmd(data, km.State()),
-        ),
-        (km.identify.constrained_edmd(data, km.State(), prior=free, ridge="gcv"), km.edmd(data, km.State())),
+        (stable(ridge="gcv", radius=5.0), stable(radius=5.0)),
+        (stable(ridge="gcv", radius=0.5), stable(radius=0.5)),
+        (constrained(prior=none, ridge="gcv"), km.edmd(data, km.State())),
+        (constrained(prior=free, ridge="gcv"), km.edmd(data, km.State())),
     ):
         assert model.report.ridge == plain.report.ridge
         assert "chosen by generalised cross-validation" in model.report.route
         assert not np.array_equal(model.A, same.A)
-    fixed = km.identify.constrained_edmd(data, km.State(), prior=free, ridge=plain.report.ridge)
-    assert np.array_equal(fixed.A, km.identify.constrained_edmd(data, km.State(), prior=free, ridge="gcv").A)
-    assert np.allclose(
-        km.identify.constrained_edmd(data, km.State(), prior=km.identify.Prior(), ridge="gcv").A, plain.A, atol=1e-12
-    )
+    assert np.array_equal(constrained(prior=free, ridge=plain.report.ridge).A, constrained(prior=free, ridge="gcv").A)
+    assert np.allclose(constrained(prior=none, ridge="gcv").A, plain.A, atol=1e-12)
 
 
 def test_more_observables_than_the_inequality_takes() -> None:
