@@ -131,7 +131,7 @@ class Counting:
             yield random_episodes(i, [50], 2, 1)
 
 
-@pytest.mark.parametrize(("flat", "route", "most"), [(0, "gram", 1 + 20), (1, "qr", 1 + 3 + 20)])
+@pytest.mark.parametrize(("flat", "route", "most"), [(0, "gram", 1 + 20), (1, "qr", 1 + 5 + 20)])
 def test_a_replayable_stream_is_judged_by_its_first_sets(
     flat: int, route: str, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

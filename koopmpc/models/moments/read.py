@@ -25,7 +25,7 @@ Weights = Callable[[Episode], ArrayLike] | Sequence[ArrayLike] | Float[np.ndarra
 Steps = list[Float[np.ndarray, " T"]]  # the weights of each episode, one for each step
 
 _WELL_CONDITIONED = 1e6  # up to this scaled cond(Z) Gram sums lose no accuracy
-_ENOUGH = 4  # pairs for each regressor from which the condition of the first parts tells that of all
+_PILOT = 4  # read all parts by "qr" if the Gram sums of so many first ones are ill-conditioned
 
 
 class ReadOptions(TypedDict, total=False):
@@ -117,14 +117,11 @@ def _add_up(
     parts, total = source.parts(), zero
     lazy = (replace(reading, part=part, route=cast("Route", zero.route)) for part in parts)
     tasks = list(lazy) if isinstance(parts, Sized) else lazy
-    waits = judged and not (isinstance(parts, Sized) and len(parts) == 1)
-    for sums in run(tasks):
+    for i, sums in enumerate(run(tasks), 1):
         each = replace(zero, **sums._asdict())
         total = total + each if total.samples else each
-        if waits and total.samples >= _ENOUGH * total.columns.regressors.size:
-            if total.condition > _WELL_CONDITIONED:
-                return None
-            waits = False
+        if judged and i == _PILOT and total.condition > _WELL_CONDITIONED:
+            return None
     if not total.samples:
         raise DataError("all weights are 0; give some pair a weight above 0")
     return None if judged and total.condition > _WELL_CONDITIONED else total
