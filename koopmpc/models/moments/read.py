@@ -25,7 +25,7 @@ Weights = Callable[[Episode], ArrayLike] | Sequence[ArrayLike] | Float[np.ndarra
 Steps = list[Float[np.ndarray, " T"]]  # the weights of each episode, one for each step
 
 _WELL_CONDITIONED = 1e6  # up to this scaled cond(Z) Gram sums lose no accuracy
-_PILOT = 4  # read all parts by "qr" if the Gram sums of so many first ones are ill-conditioned
+_PILOT = 4  # after so many parts, with so many pairs a regressor, ill-conditioned sums are given up
 
 
 class ReadOptions(TypedDict, total=False):
@@ -120,7 +120,8 @@ def _add_up(
     for i, sums in enumerate(run(tasks), 1):
         each = replace(zero, **sums._asdict())
         total = total + each if total.samples else each
-        if judged and i == _PILOT and total.condition > _WELL_CONDITIONED:
+        enough = i == _PILOT and total.samples >= _PILOT * total.columns.regressors.size
+        if judged and enough and total.condition > _WELL_CONDITIONED:
             return None
     if not total.samples:
         raise DataError("all weights are 0; give some pair a weight above 0")
