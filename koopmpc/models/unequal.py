@@ -257,6 +257,8 @@ def unequal_rates(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FitWarning)  # rows with bridged gaps are a start alone
         model = fit(_bridge(data, "line"))
+    if not set(data.states) <= set(model.lifting.names):
+        raise DataError(f"the lifting lacks a state; pass km.State() + … of {', '.join(data.states)}")
     places, error = rows_of_states(model), MeasuredError(model, np.where(size > 0, size, 1.0), crossed=scheduled_inputs)
     lengths = sorted({max(wanted // 2, past + 1), wanted})
     best: _Found | None = None

@@ -197,7 +197,7 @@ def test_fits_say_what_they_cannot_take():
         km.identify.unequal_rates(data, km.State())
     with pytest.raises(km.errors.DataError, match="the longest has 2, pass a shorter horizon"):
         km.identify.unequal_rates(data, km.State(), horizon=5)
-    with pytest.raises(km.errors.DataError, match="C does not pick the states"):
+    with pytest.raises(km.errors.DataError, match="lacks a state"):
         km.identify.unequal_rates(data, km.State(["x0"]))
     with pytest.raises(km.errors.DataError, match="pass W, and bilinear=True"):
         km.identify.unequal_rates(data, km.State(), bilinear=True, scheduled_inputs=True)
