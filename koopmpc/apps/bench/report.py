@@ -22,6 +22,7 @@ from koopmpc.base.terminal import build_plain_table
 from koopmpc.base.text import format_duration
 from koopmpc.control.move import Fallback, Status
 from koopmpc.loop.metrics import Metrics
+from koopmpc.loop.run import Run
 from koopmpc.views.figures.reports import draw_attraction, draw_profiles, draw_step_times, draw_trajectories
 from koopmpc.views.figures.style import render_svg
 from koopmpc.views.recording.description import STATUS_WORDS
@@ -331,16 +332,16 @@ def _draw_case(own: Sequence[RunRow], folder: Path, *, most: int = 12, starts: i
     logs = {row.controller: folder / f"{row.name}.rrd" for row in usual if row.start == row.seed == 0}
     runs = {name: load_run(log) for name, log in [*logs.items()][:most] if log.is_file()}
     many = {name: rows for name, rows in ended.items() if len(rows) >= starts}
-    alone = "" if len(usual) == len(own) else ", without noise and with the plant as it is"
+    alone = ", without noise and with the plant as it is" * (len(usual) != len(own))
     if many and len(next(iter(many.values()))[0].x0) > 1:
-        states = next(iter(runs.values())).states if runs else ()
-        yield _draw_starts(many, states), f"Initial states that reach their reference, and not{alone}."
+        yield _draw_starts(many, runs), f"Initial states that reach their reference, and not{alone}."
     if runs:
         yield render_svg(draw_trajectories(runs)), "The case's own start."
 
 
-def _draw_starts(rows: Mapping[str, Sequence[RunRow]], named: Sequence[str]) -> str:
-    """Return a map of starts over the two states that differ most among them."""
+def _draw_starts(rows: Mapping[str, Sequence[RunRow]], runs: Mapping[str, Run]) -> str:
+    """Return a map of starts over the two states that differ most among them; a run knows their names."""
+    named = next(iter(runs.values())).states if runs else ()
     starts = {name: np.array([row.x0 for row in own]) for name, own in rows.items()}
     spread = np.ptp(np.vstack(list(starts.values())), axis=0)
     shown = np.sort(np.argsort(-spread, kind="stable")[:2])

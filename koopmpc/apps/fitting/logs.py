@@ -224,7 +224,7 @@ def _divide_episodes(
 ) -> DividedData:
     past = max(PAST, delay)
     lengths = [len(episode) for episode in episodes]
-    same = "" if min(lengths) == max(lengths) else f"{min(lengths)} to "
+    same = f"{min(lengths)} to " * (min(lengths) != max(lengths))
     number = len(episodes)
     size = f"{files}: {number} episode{'s' * (number > 1)} of {same}{max(lengths)} steps, {sum(lengths)} in all"
     ahead = usual_horizon(episodes, past)[0] if horizon is None else horizon
