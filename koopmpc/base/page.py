@@ -151,23 +151,4 @@ class Page:
 
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"  # a browser loads nothing from elsewhere
-_STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;color:#111;background:#fff;max-width:1100px;margin:0 auto;padding:1rem}
-h1{font-size:1.5rem;overflow-wrap:anywhere}h2{font-size:1.2rem;margin-top:2.5rem;border-top:1px solid #bbb;
-padding-top:1rem}h3{font-size:1rem;margin:1.5rem 0 .5rem}p,li{max-width:46rem;overflow-wrap:anywhere}
-.wide{overflow-x:auto;margin:.8rem 0}table{border-collapse:collapse;font-size:.85rem;font-variant-numeric:tabular-nums}
-th,td{padding:.25rem .6rem;text-align:right;white-space:nowrap;border-bottom:1px solid #ddd}
-th:first-child,td:first-child{text-align:left}.words td:nth-child(2),.words th:nth-child(2){text-align:left;
-white-space:normal;min-width:9rem}
-th{border-bottom:2px solid #555}figure{margin:1.5rem 0;overflow-x:auto}
-figure svg{width:100%;min-width:560px;height:auto}figcaption{font-size:.85rem;color:#333}
-.grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(20rem,100%),1fr));gap:1rem 1.5rem;margin:1rem 0}
-.grid figure{margin:0}.grid figure svg{min-width:0}pre{font:.8rem/1.4 ui-monospace,monospace;background:#f4f4f4;
-padding:.7rem;overflow-x:auto}.said{border-left:.35rem solid #555;background:#f4f4f4;padding:.6rem 1rem;max-width:46rem}
-.good{border-color:#009e73}.bad{border-color:#8c1d18}.doubt{border-color:#c28e00}.said p{margin:.2rem 0}
-details{font-size:.85rem}a{color:#003a7d;overflow-wrap:anywhere}
-@media print{body{max-width:none;padding:0;font-size:11px}figure,tr,.said{break-inside:avoid}
-h2,h3{break-after:avoid}pre{white-space:pre-wrap;overflow-wrap:anywhere;font-size:.7rem}
-.wide,figure{overflow:visible}th,td{white-space:normal;padding:.15rem .35rem;font-size:.7rem}
-.grid{grid-template-columns:repeat(2,1fr)}figure svg{min-width:0}}
-"""
+_STYLE = Path(__file__).with_name("page.css").read_text("utf-8")
