@@ -208,8 +208,7 @@ def targets_of(predictor: LinearPredictor, track: LiftedTracking) -> Targets:
         track.tracked,
         track.Q_root,
         track.inputs,
-        track.limited,
-        track.outputs,
+        (track.limited, track.outputs),
         constant,
         hold=hold,
         R_root=track.R_root,
@@ -223,8 +222,7 @@ def targets(
     C: Float[np.ndarray, "nr nz"],
     Q_root: Float[np.ndarray, "nr nr"],
     inputs: Interval,
-    G: Float[np.ndarray, "ng nz"],
-    outputs: Interval,
+    limited: tuple[Float[np.ndarray, "ng nz"], Interval],
     constant: int | None,
     *,
     hold: bool,
@@ -240,6 +238,8 @@ def targets(
     ----------
     Q_root
         S with SᵀS = Q.
+    limited
+        G, and the limits of G z.
     constant
         Index of the Constant observable, pinned to 1.
     hold
@@ -249,7 +249,7 @@ def targets(
     sizes
         Sizes of the entries of [z; u], by default 1.
     """
-    nz, nu = len(A), B.shape[1]
+    (nz, nu), (G, outputs) = B.shape, limited
     measure = checks.array(1.0 if sizes is None else sizes, "sizes") * np.ones(nz + nu)
     size = measure[:nz]
     E, push = np.hstack([A - np.eye(nz), B]) * measure / size[:, None], np.diag(1 / size)

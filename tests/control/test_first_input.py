@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.step.first_input import FirstInput
+from koopmpc.control.step.observe import FirstInput
 from tests.control.models import linear
 
 A, B = np.array([[1.0, 0.1], [0.15, 0.98]]), np.array([[0.005], [0.1]])

@@ -34,7 +34,7 @@ def test_without_limits_it_is_the_nearest_equilibrium(seed, nz, nu, constant):
     rng, A, B, C, Q, pinned = system(seed, nz, nu, constant)
     nothing = np.zeros((0, len(A)))
     free, no = Interval(np.full(nu, -np.inf), np.full(nu, np.inf)), Interval(np.zeros(0), np.zeros(0))
-    found = targets(A, B, C, np.linalg.cholesky(Q).T, free, nothing, no, pinned, hold=True)
+    found = targets(A, B, C, np.linalg.cholesky(Q).T, free, (nothing, no), pinned, hold=True)
     R = rng.normal(size=(3, len(C)))
     for r, alpha in zip(R, found.coordinates(R), strict=True):
         z, u = found.z0 + found.Z @ alpha, found.u0 + found.W @ alpha
@@ -42,7 +42,7 @@ def test_without_limits_it_is_the_nearest_equilibrium(seed, nz, nu, constant):
         other, _ = equilibrium(A, B, C, Q, r, pinned)
         distance = lambda v, r=r: (C @ v - r) @ Q @ (C @ v - r)  # noqa: E731
         assert distance(z) <= distance(other) * (1 + 1e-6) + 1e-9 * np.trace(Q)
-    at_zero = targets(A, B, C, np.linalg.cholesky(Q).T, free, nothing, no, pinned, hold=False)
+    at_zero = targets(A, B, C, np.linalg.cholesky(Q).T, free, (nothing, no), pinned, hold=False)
     assert not at_zero.u0.any()
     assert not at_zero.W.any()
     np.testing.assert_array_equal(at_zero.coordinates(R), found.coordinates(R))
@@ -55,7 +55,7 @@ def test_with_limits_it_is_the_nearest_inside_them(seed, nz, nu, size):
     G = rng.normal(size=(int(rng.integers(0, 3)), nz))
     inputs = Interval(-(high := rng.uniform(0.1, 1, nu)), high)
     outputs = Interval(-(high := rng.uniform(0.1, 2, len(G))), high)
-    found = targets(A, B, C, np.linalg.cholesky(Q).T, inputs, G, outputs, None, hold=True)
+    found = targets(A, B, C, np.linalg.cholesky(Q).T, inputs, (G, outputs), None, hold=True)
     r = size * rng.normal(size=len(C))
     alpha = found.coordinates(r[None])[0]
     z, u = found.z0 + found.Z @ alpha, found.u0 + found.W @ alpha
@@ -78,7 +78,7 @@ def test_where_no_equilibrium_meets_the_state_limits_the_inputs_still_hold():
     """Rest at 4 ≤ x ≤ 5 would take |u| > 1: the target is the nearest that the inputs hold."""
     A, B = np.array([[0.5]]), np.array([[1.0]])
     state = Interval(np.array([4.0]), np.array([5.0]))  # x = 2 u at rest
-    found = targets(A, B, np.eye(1), np.eye(1), Interval(-np.ones(1), np.ones(1)), np.eye(1), state, None, hold=True)
+    found = targets(A, B, np.eye(1), np.eye(1), Interval(-np.ones(1), np.ones(1)), (np.eye(1), state), None, hold=True)
     alpha = found.coordinates(np.array([[4.5]]))[0]
     np.testing.assert_allclose(found.z0 + found.Z @ alpha, [2.0], atol=1e-6)
     np.testing.assert_allclose(found.u0 + found.W @ alpha, [1.0], atol=1e-6)
@@ -89,7 +89,7 @@ def test_where_no_equilibrium_meets_the_input_limits_the_target_is_the_first_one
     A, B = np.array([[1.0, 0.5], [0.0, 1.0]]), np.array([[1.0], [0.0]])
     none = Interval(np.zeros(0), np.zeros(0))
     found = targets(
-        A, B, np.eye(1, 2), np.eye(1), Interval(np.zeros(1), np.ones(1)), np.zeros((0, 2)), none, 1, hold=True
+        A, B, np.eye(1, 2), np.eye(1), Interval(np.zeros(1), np.ones(1)), (np.zeros((0, 2)), none), 1, hold=True
     )
     for r in (4.5, -3.0):
         alpha = found.coordinates(np.array([[r], [2 * r]]))
@@ -105,15 +105,14 @@ def test_a_disturbance_is_a_constant_of_the_model(seed, nz, nu, size):
     G, R_root = rng.normal(size=(1, nz)), np.diag(rng.uniform(0.2, 5, nu))
     inputs, outputs = Interval(-2 * np.ones(nu), np.ones(nu)), Interval(np.full(1, -np.inf), np.full(1, 2.0))
     whole = np.block([[A, e[:, None]], [np.zeros((1, nz)), np.ones((1, 1))]])
-    pushed = targets(A, B, C, root, inputs, G, outputs, None, hold=True, R_root=R_root)
+    pushed = targets(A, B, C, root, inputs, (G, outputs), None, hold=True, R_root=R_root)
     own = targets(
         whole,
         np.vstack([B, np.zeros((1, nu))]),
         np.hstack([C, np.zeros((len(C), 1))]),
         root,
         inputs,
-        np.hstack([G, np.zeros((1, 1))]),
-        outputs,
+        (np.hstack([G, np.zeros((1, 1))]), outputs),
         nz,
         hold=True,
         R_root=R_root,
@@ -138,7 +137,7 @@ def test_of_all_equilibria_as_near_the_one_that_costs_least_is_taken(seed, nz):
     A, B, C = 0.5 * rng.normal(size=(nz, nz)), rng.normal(size=(nz, nu)), rng.normal(size=(1, nz))
     R = np.diag(rng.uniform(0.2, 5, nu))
     none, free = Interval(np.zeros(0), np.zeros(0)), Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
-    found = targets(A, B, C, np.eye(1), free, np.zeros((0, nz)), none, None, hold=True, R_root=np.sqrt(R))
+    found = targets(A, B, C, np.eye(1), free, (np.zeros((0, nz)), none), None, hold=True, R_root=np.sqrt(R))
     r, e = rng.normal(size=1), 0.3 * rng.normal(size=nz)
     alpha = found.coordinates(r[None], e)[0]
     u = found.u0 + found.u_disturbance @ e + found.W @ alpha

@@ -25,8 +25,7 @@ from koopmpc.control.solvers.ball import BallSolver
 from koopmpc.control.solvers.base import StepSolver
 from koopmpc.control.solvers.levels import LevelSearch, LevelSolver
 from koopmpc.control.solvers.priorities import PrioritySolver
-from koopmpc.control.step.first_input import FirstInput
-from koopmpc.control.step.observe import GivenInputs, InitialCondition, ReferenceShare
+from koopmpc.control.step.observe import FirstInput, GivenInputs, InitialCondition, ReferenceShare
 from koopmpc.estimate.observer import StateObserver
 
 _FAR = 1e12  # length² of multipliers above which rounding shows in an input, 1 moving it to its limit
