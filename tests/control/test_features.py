@@ -1,7 +1,6 @@
 """Rates, blocks, disturbances and soft rows: against CVXPY, against each other, and in what is returned."""
 
 import copy
-import pickle
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -356,23 +355,6 @@ def whole(seed=0):
     limits = km.Limits(-0.6, 0.6, du_max=0.2, x_max=[0.7, 0.4], slack=([10.0, np.inf], 1.0))
     cost = km.Cost([2, 0.5], 0.1, R_delta=0.05)
     return km.KoopmanMPC(model, cost, limits, 10, moves=6, estimator=Told([0.01, 0.0, 0.0]))
-
-
-@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda mpc: pickle.loads(pickle.dumps(mpc))])
-@pytest.mark.parametrize("steps", [0, 5])
-def test_a_copy_goes_on_as_its_original(copied, steps):
-    original = whole()
-    closed_loop(original, steps, w=[0.1])
-    twin = copied(original)
-    if steps:
-        np.testing.assert_array_equal(twin.plan().U, original.plan().U)
-        np.testing.assert_array_equal(twin.plan().X, original.plan().X)
-    same = [(move.u.tobytes(), move.status, move.iterations) for move in closed_loop(original, w=[0.1])]
-    assert [(m.u.tobytes(), m.status, m.iterations) for m in closed_loop(twin, w=[0.1])] == same
-    assert len({status for _, status, _ in same}) > 1
-    bad = [mpc([np.nan, 0], [0, 0]) for mpc in (original, twin)]
-    assert bad[0].u.tobytes() == bad[1].u.tobytes()
-    assert bad[0].fallback is bad[1].fallback
 
 
 def test_controllers_in_threads_do_not_disturb_each_other():
