@@ -1,7 +1,7 @@
 """The levels of on/off and stepped inputs, their dwell times, and how long each input has held its level."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
@@ -177,21 +177,24 @@ def leveled_moves(levels: InputLevels, blocks: Sequence[int]) -> int:
     return len(blocks) if levels.steps is None else int(np.searchsorted(_starts(blocks), levels.steps))
 
 
+def _check_each(given: Any, what: str, advice: str, check: Callable[[Any, str], Any]) -> Any:
+    """Return what is given by the name of an input, or for each input, every entry checked; None has no entry."""
+    if isinstance(given, Mapping):
+        return {str(name): check(entry, str(name)) for name, entry in cast("Mapping[str, Any]", given).items()}
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        raise DataError(f"{what} is {given!r}; pass {advice}")
+    entries = enumerate(cast("Sequence[Any]", given))
+    return tuple(None if entry is None else check(entry, f"input {i}") for i, entry in entries)
+
+
 def check_levels(levels: Any) -> Any:
-    """Return levels with an array for each input, None where one has none."""
-    if isinstance(levels, Mapping):
-        named = cast("Mapping[str, Any]", levels)
-        if not named:
-            raise DataError('levels is {}; pass levels by the name of an input, for example {"pump": [0, 1]}')
-        return {str(name): _check_values(values, str(name)) for name, values in named.items()}
-    if not isinstance(levels, Sequence) or isinstance(levels, str):
-        raise DataError(
-            f'levels is {levels!r}; pass them by name, {{"pump": [0, 1]}}, or for each input, [[0, 1], None]'
-        )
-    rows = cast("Sequence[Any]", levels)
-    if rows and all(isinstance(value, int | float) for value in rows):
+    """Return levels with an array for each input, None where one has none: two, or evenly spaced ones in order."""
+    if isinstance(levels, Mapping) and not levels:
+        raise DataError('levels is {}; pass levels by the name of an input, for example {"pump": [0, 1]}')
+    if isinstance(levels, Sequence) and levels and all(isinstance(value, int | float) for value in levels):
         raise DataError(f"levels is {levels!r}; pass one list for each input, for example [[0, 1]]")
-    return tuple(None if each is None else _check_values(each, f"input {i}") for i, each in enumerate(rows))
+    advice = 'them by name, {"pump": [0, 1]}, or for each input, [[0, 1], None]'
+    return _check_each(levels, "levels", advice, _check_values)
 
 
 def _check_values(values: Any, name: str) -> Float[np.ndarray, " count"]:
@@ -208,13 +211,7 @@ def _check_values(values: Any, name: str) -> Float[np.ndarray, " count"]:
 
 def check_dwell(dwell: Any) -> Any:
     """Return dwell times as (least steps at the lowest level, least steps at another) of each input."""
-    if isinstance(dwell, Mapping):
-        named = cast("Mapping[str, Any]", dwell)
-        return {str(name): _check_pair(pair, str(name)) for name, pair in named.items()}
-    if isinstance(dwell, Sequence) and not isinstance(dwell, str):
-        rows = cast("Sequence[Any]", dwell)
-        return tuple(None if pair is None else _check_pair(pair, f"input {i}") for i, pair in enumerate(rows))
-    raise DataError(f'dwell is {dwell!r}; pass steps by name, {{"pump": (3, 5)}}: at least 3 on and 5 off')
+    return _check_each(dwell, "dwell", 'steps by name, {"pump": (3, 5)}: at least 3 on and 5 off', _check_pair)
 
 
 def _check_pair(pair: Any, name: str) -> tuple[int, int]:
