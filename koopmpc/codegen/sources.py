@@ -212,7 +212,7 @@ def _write_sizes(tables: Tables, text: str, *, single: bool) -> str:
     lines = [f"#define KOOPMPC_{name} {value}" for name, value in sorted(sizes.items())]
     precision = "#define KOOPMPC_FLOAT\n#define DAQP_SINGLE_PRECISION\n" if single else ""
     functions = "#define KOOPMPC_FN(name) name##f\n" if single else "#define KOOPMPC_FN(name) name\n"
-    dt = f"#define KOOPMPC_DT {tables.program.dt!r}\n"
+    dt = f"#define KOOPMPC_DT {tables.program.model.dt!r}\n"
     dt += f"/* {tables.effort} */\n" if tables.effort else ""
     body = precision + functions + "#define KOOPMPC_SQRT KOOPMPC_FN(sqrt)\n" + dt + "\n".join(lines) + "\n"
     return _write_header("sizes", "Sizes of this controller.", body)

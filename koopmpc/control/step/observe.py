@@ -91,7 +91,7 @@ class InitialCondition:
         self.refused = False
         if self._measured is None:  # else there is nothing that it remembers
             self.observer.reset(x0)
-        self.drive[:] = 0.0
+        self.known[self._first :] = 0.0
         self._sent.extend([last.copy()] * (self._latency + 1))
         self._w = np.zeros(self._nw)
 
