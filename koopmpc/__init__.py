@@ -37,15 +37,15 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.codegen.export import export as export
     from koopmpc.control.ask.cost import Cost as Cost
     from koopmpc.control.ask.limits import Limits as Limits
+    from koopmpc.control.kinds.bilinear_mpc import BilinearMPC as BilinearMPC
     from koopmpc.control.kinds.koopman_mpc import KoopmanMPC as KoopmanMPC
     from koopmpc.control.kinds.koopman_mpc import LinearMPC as LinearMPC
-    from koopmpc.control.lqr import LQR as LQR
-    from koopmpc.control.lqr import dlqr as dlqr
-    from koopmpc.control.lqr import lqr as lqr
+    from koopmpc.control.kinds.lqr import LQR as LQR
+    from koopmpc.control.kinds.lqr import dlqr as dlqr
+    from koopmpc.control.kinds.lqr import lqr as lqr
+    from koopmpc.control.kinds.nonlinear_mpc import NonlinearMPC as NonlinearMPC
     from koopmpc.control.move import Move as Move
     from koopmpc.control.move import Status as Status
-    from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC as BilinearMPC
-    from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC as NonlinearMPC
     from koopmpc.data.collect import Uniform as Uniform
     from koopmpc.data.collect import collect as collect
     from koopmpc.data.delay import Delay as Delay
@@ -128,9 +128,9 @@ else:
         core=(
             "apps.bench.problem",
             "control.kinds.koopman_mpc",
-            "control.lqr",
-            "control.nonlinear.bilinear_mpc",
-            "control.nonlinear.nonlinear_mpc",
+            "control.kinds.lqr",
+            "control.kinds.bilinear_mpc",
+            "control.kinds.nonlinear_mpc",
             "data.collect",
             "models.fits.bilinear",
             "models.fits.edmd",
@@ -148,12 +148,12 @@ else:
                 "views.recording.reader",
             ),
             "controllers": (
-                "control.lqr",
-                "control.eigenfunction_lqr",
+                "control.kinds.lqr",
+                "control.kinds.eigenfunction_lqr",
                 "control.kinds.koopman_mpc",
-                "control.nonlinear.bilinear_mpc",
-                "control.nonlinear.nonlinear_mpc",
-                "control.pid",
+                "control.kinds.bilinear_mpc",
+                "control.kinds.nonlinear_mpc",
+                "control.kinds.pid",
                 "loop.adaptive",
                 "loop.guarded",
                 "loop.station",

@@ -12,8 +12,6 @@ from koopmpc.base.errors import DataError
 from koopmpc.codegen import tolerances
 from koopmpc.codegen.tables import CFunction, Tables, write_fields
 from koopmpc.control.ask.levels import FREE
-from koopmpc.control.lqr import FeedbackProgram
-from koopmpc.control.nonlinear import motion
 from koopmpc.control.nonlinear.iteration import MOST
 from koopmpc.control.nonlinear.staged_program import StagedProgram
 from koopmpc.control.nonlinear.stagewise import list_hard_outputs
@@ -21,6 +19,8 @@ from koopmpc.control.plan.condensed_program import BoundsProgram, CondensedProgr
 from koopmpc.control.program import Published, StepProgram, no_export
 from koopmpc.control.solvers.daqp import FEW, MOVED
 from koopmpc.control.solvers.levels import NODES
+from koopmpc.control.step import aim as motion
+from koopmpc.control.step.feedback import FeedbackProgram
 from koopmpc.estimate.disturbance import EXACT, DisturbanceProgram
 from koopmpc.estimate.filter import FilterProgram
 from koopmpc.estimate.gate import BEYOND, BRIDGED

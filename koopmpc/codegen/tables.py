@@ -25,11 +25,11 @@ from typing import Any, Literal, NamedTuple, cast
 import numpy as np
 
 from koopmpc.codegen import tolerances
-from koopmpc.control.lqr import FeedbackProgram
 from koopmpc.control.nonlinear.staged_program import StagedProgram
 from koopmpc.control.nonlinear.stagewise import Sides
 from koopmpc.control.program import LinearProgram, StepProgram
 from koopmpc.control.solvers.scaled_qp import DAQPSetup
+from koopmpc.control.step.feedback import FeedbackProgram
 from koopmpc.estimate.filter import FilterProgram
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.plants.graph import Graph

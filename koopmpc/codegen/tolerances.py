@@ -1,15 +1,15 @@
 """The tolerances of C code: as in Python, and in single precision, whose rounding is 5e8 times as coarse."""
 
 from koopmpc.control.ask.levels import NEAR
-from koopmpc.control.nonlinear import motion
-from koopmpc.control.nonlinear.active_limits import RANK
+from koopmpc.control.nonlinear.equilibrium import RANK
 from koopmpc.control.nonlinear.equilibrium import SETTLED as HELD
 from koopmpc.control.nonlinear.iteration import DIGITS, ENOUGH, PRECISE, STUCK
 from koopmpc.control.nonlinear.real_time_solver import SETTLED
-from koopmpc.control.nonlinear.staged_mpc import NO_DIGITS
 from koopmpc.control.plan.row_targets import PSEUDO
 from koopmpc.control.riccati import SETTLED as RESTED
 from koopmpc.control.solvers.sequences import EQUAL
+from koopmpc.control.step import aim as motion
+from koopmpc.control.step.staged import NO_DIGITS
 from koopmpc.control.target import ROUNDING
 from koopmpc.estimate.gate import ROUNDING as AT_REST
 

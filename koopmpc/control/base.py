@@ -4,21 +4,18 @@ import copy
 from time import perf_counter
 from typing import Any, TypeVar
 
-import numpy as np
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
-from koopmpc.base.values import Interval, Value
-from koopmpc.control.ask.levels import HeldLevels
-from koopmpc.control.move import Fallback, Move, PlanMemory, Status, Token
+from koopmpc.base.values import Value
+from koopmpc.control.move import Move, Token
 from koopmpc.control.plan.task import MoveBlocks
 from koopmpc.control.plan.tracking import Tracking
 from koopmpc.control.program import Published, SavedController
 from koopmpc.control.step.observe import InitialCondition
-from koopmpc.control.watching import StepMonitor, StepWatch
-from koopmpc.estimate.observer import Estimator, StateModel, StateObserver
+from koopmpc.control.watching import StepWatch
+from koopmpc.estimate.observer import Estimator, StateObserver
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.plants.step_map import StepMap
 
@@ -143,106 +140,3 @@ class PredictiveController(Published):
         move.known = watch.look(self._initial, move.u, applied)
         move.solve_time = perf_counter() - start
         return move
-
-
-class MPCBase(PredictiveController):
-    """A controller that plans stage by stage, of an input that acts `latency` steps after it was computed.
-
-    A subclass calls `_keep` with every good plan, ends a step with `_move` or `_fail`, and returns in `_made_of` the
-    data for `save`.
-
-    Parameters
-    ----------
-    dt
-        Sampling time [s].
-    model
-        The model of the plan.
-    tracking
-        The tracked and limited outputs, with their weights and limits.
-    moves
-        N steps, and which of them hold their inputs; a plan has an input for each step, with a change of 0 in held
-        ones.
-    observer, estimator
-        The observer of this controller, and the rule that started it, None where y is the state.
-    latency
-        Steps until the first input of a plan acts.
-    time_limit
-        Wall-clock time of a step [s].
-    monitor
-        Says of each step whether the model knows it; None without a monitor.
-    """
-
-    solver_fails = False  # fault injection sets it, see control.move.Fallible
-
-    def __init__(
-        self,
-        dt: float,
-        model: StateModel,
-        tracking: Tracking[Any],
-        moves: MoveBlocks,
-        observer: StateObserver,
-        estimator: Estimator | None,
-        latency: int,
-        time_limit: float | None,
-        *,
-        monitor: StepMonitor | None = None,
-    ) -> None:
-        watch = None if monitor is None else monitor.watch(model, checks.count(latency, "latency", 0))
-        super().__init__(dt, tracking, moves, latency, estimator, time_limit, watch)
-        self._inputs, self._rates, self._hard_rates = tracking.inputs, tracking.rates, tracking.hard_rates
-        self._blocks, self._N = moves.lengths, sum(moves.lengths)
-        self._with_rates = tracking.with_rates or len(self._blocks) < self._N or moves.own
-        self._allowed = np.inf if self._time_limit is None else self._time_limit
-        self._initial = InitialCondition(
-            model, observer, self._N, self._latency, with_rates=self._with_rates, estimated=estimator is not None
-        )
-        levels = tracking.levels
-        self._held = None if levels is None else HeldLevels(levels)
-        self._memory = PlanMemory(self.nu, np.arange(self._N), self._held, self._latency, self._allowed)
-        MPCBase.reset(self)
-
-    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
-        """Forget all earlier steps, so that a run repeats to the bit; a filter starts at x0 (nx,), by default at zero.
-
-        Rates count from `u_prev`, zero moved inside the limits by default; it is held if the first step fails.
-
-        Raises
-        ------
-        DataError
-            x0 or u_prev is of another length, or holds what is no finite number; pass None where it is not known.
-        """
-        self._memory.reset(u_prev, self._present_limits()[0])
-        self._initial.reset(x0, self._memory.given)
-        if self._watch is not None:
-            self._watch.reset()
-
-    @property
-    def _planned(self) -> bool:
-        """Whether the last step had a plan."""
-        return self._memory.is_planned
-
-    def _present_limits(self) -> tuple[Interval, Interval | None]:
-        """Return the box of the next input and that of its change; a subclass knows where they move in time."""
-        return self._inputs, self._rates
-
-    def _keep(self, plan: Float[np.ndarray, " nv"]) -> None:
-        """Keep a good plan (by reference, for speed); its first entries are the moves."""
-        self._memory.keep(plan, plan[: self.nu])
-
-    def _move(
-        self, u: Float[np.ndarray, " nu"], status: Status, iterations: int, start: float, slack: float = 0.0
-    ) -> Move:
-        """Return a good step; a late one says so."""
-        status, taken = self._memory.judge_time(status, start)
-        return Move(u, status, Fallback.NONE, taken, iterations, slack)
-
-    def _fail(
-        self,
-        free: Float[np.ndarray, " nu"] | None,
-        applied: ArrayLike | None,
-        status: Status,
-        iterations: int,
-        start: float,
-    ) -> Move:
-        """Return the move that replaces a failed step; see `PlanMemory`."""
-        return self._memory.fall_back(status, start, applied, self._present_limits(), free, iterations)

@@ -18,9 +18,9 @@ from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Interval, Limits
 from koopmpc.control.ask.terminal import TerminalFeedback, TerminalSet
 from koopmpc.control.kinds import ControllerKind, register_controller
-from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone
 from koopmpc.control.program import Program, SavedController, no_export
+from koopmpc.control.step.feedback import FeedbackLaw
 from koopmpc.guarantees.deviation import DeviationModel, measure_spending
 from koopmpc.guarantees.error_bounds import ErrorBound
 from koopmpc.models.base import load_value, save_value

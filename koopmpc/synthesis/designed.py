@@ -15,9 +15,9 @@ from koopmpc.base.terminal import build_leaderboard, render_text
 from koopmpc.base.text import format_duration, to_percent
 from koopmpc.base.values import Value
 from koopmpc.control.kinds import build_controller
+from koopmpc.control.kinds.bilinear_mpc import BilinearMPC
 from koopmpc.control.kinds.koopman_mpc import KoopmanMPC
-from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
-from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
+from koopmpc.control.kinds.nonlinear_mpc import NonlinearMPC
 from koopmpc.control.program import SavedController
 from koopmpc.data.episodes import Episodes
 from koopmpc.loop.guarded import Guarded

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError, FitWarning, KoopmpcError, ShapeError
 from koopmpc.base.values import Value
-from koopmpc.control.lqr import dlqr
+from koopmpc.control.kinds.lqr import dlqr
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Excitation, Feedback, Noise
 from koopmpc.plants.plant import Plant, SimulatedPlant, require_plant

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from tests.control.test_equilibrium import row_targets
 
 
 def unstable_model():
@@ -72,14 +71,3 @@ def test_a_nonlinear_controller_with_much_time_gives_the_same_input():
         timed = km.NonlinearMPC(*asked, solver=solver, time_limit=60.0)
         np.testing.assert_array_equal(timed(x, [0, 0]).u, km.NonlinearMPC(*asked, solver=solver)(x, [0, 0]).u)
         assert timed(x, [0, 0]).status is km.Status.OPTIMAL
-
-
-def test_after_the_deadline_a_step_searches_one_equilibrium_and_the_next_steps_the_others():
-    rows = [np.array([r, 0.0]) for r in (0.5, -2.0, 4.0, -8.0)]
-    late, free = (row_targets(unstable_model(), km.Limits(-1, 1), km.Cost([1, 1], 1e-3)) for _ in range(2))
-    for left in (3, 2, 1, 0):
-        targets, is_late = late.find(rows, deadline=-np.inf)
-        assert sum(not target.is_found for target in targets) == left
-        assert is_late == (left > 0)
-    for target, wanted in zip(late.find(rows)[0], free.find(rows)[0], strict=True):
-        np.testing.assert_allclose(target.u, wanted.u, atol=1e-9)

@@ -11,11 +11,10 @@ from scipy.linalg import solve_discrete_are
 
 import koopmpc as km
 from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibria
-from koopmpc.control.nonlinear.learned_map import learned_map
-from koopmpc.control.plan.row_targets import RowTarget, RowTargets
+from koopmpc.control.nonlinear.stages import learned_map
+from koopmpc.control.plan.row_targets import MovingEnd, RowTarget, RowTargets
 from koopmpc.control.plan.tracking import state_tracking
 from koopmpc.control.riccati import one_step, stationary
-from koopmpc.control.step.aim import MovingEnd
 from tests.closed_loop.tasks import TASKS
 from tests.control.test_bilinear_mpc import UPRIGHT, pendulum
 from tests.control.test_nonlinear_mpc import pendulum as hinge
@@ -36,7 +35,7 @@ def equilibria(model, limits: km.Limits, cost: km.Cost = COST) -> Equilibria:
 
 
 def row_targets(model, limits: km.Limits = WIDE, cost: km.Cost = COST) -> RowTargets:
-    return RowTargets(learned_map(model), cost, state_tracking(model.states, model.inputs, cost, limits), 1000)
+    return RowTargets(learned_map(model), state_tracking(model.states, model.inputs, cost, limits), 1000)
 
 
 def find(targets: RowTargets, row) -> RowTarget:

@@ -57,7 +57,7 @@ def test_sequences_cost_no_more_than_what_branch_and_bound_finds(more, monkeypat
     for searched in (True, False):
         mpc = km.NonlinearMPC(make_swing(), km.Cost(**COST), km.Limits(levels=[[-1, 0, 1]], **more), 5)
         if not searched:
-            monkeypatch.setattr(mpc._solver, "_rollouts", None)
+            monkeypatch.setattr(mpc._step.solver, "_rollouts", None)
         assert mpc(x, [0, 0]).status in (km.Status.OPTIMAL, km.Status.SOFTENED)
         costs.append(cost_of(x, mpc.plan().U[:, 0]))
     assert costs[0] <= costs[1] * (1 + 1e-9)

@@ -3,11 +3,8 @@
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.nonlinear.motion import extend_rows
 
 WAYS = (None, "motion", "rest")
 A, B = np.array([[1.0, 0.1], [-0.2, 0.95]]), np.array([[0.005], [0.1]])
@@ -21,38 +18,6 @@ def plant():
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
     F, h = ca.Function("F", [x, u], [line(x, u)]), ca.Function("h", [x], [x])
     return km.StepMap(F, 0.1, h, ("p", "v"), ("u",), ("p", "v"))
-
-
-@given(
-    period=st.floats(5, 200),
-    phase=st.floats(0, 6),
-    slope=st.floats(-2, 2),
-    offset=st.floats(-50, 50),
-    size=st.floats(0.1, 9),
-)
-@settings(max_examples=60, deadline=None)
-def test_sines_and_ramps_go_on(period, phase, slope, offset, size):
-    k = np.arange(70)
-    sine, ramp = size * np.sin(2 * np.pi * k / period + phase) + offset, slope * k + offset
-    rows = np.column_stack([sine, ramp, np.full(70, offset)])
-    for columns in (rows[:, ::2], rows[:, 1:]):
-        course = extend_rows(columns[:20], 3)
-        if np.ptp(columns[:20], axis=0).max() > 1e-3:
-            seen = 19 if course.drifts else 50  # a ramp goes on for a horizon, and rests then
-            np.testing.assert_allclose(
-                course.rows[:seen], columns[20 : 20 + seen], atol=2e-4 * (1 + np.abs(rows).max())
-            )
-            assert (course.rows[seen:] == course.rows[seen - 1]).all() or not course.drifts
-
-
-def test_rows_that_rest_or_obey_no_recurrence_do_not_go_on():
-    rng = np.random.default_rng(0)
-    step = np.repeat([0.0, 1.0], [9, 6])
-    for column in (np.ones(15), step, rng.uniform(size=15), 1.2 ** np.arange(15)):
-        assert extend_rows(column[:, None]).rows.shape == (0, 1)
-    assert extend_rows(np.column_stack([np.sin(np.arange(15)), rng.uniform(size=15)])).rows.shape == (0, 2)
-    assert extend_rows(np.arange(5.0)[:, None]).rows.shape == (0, 1)  # too few rows to tell
-    assert extend_rows(np.round(np.sin(np.arange(15) / 9), 3)[:, None]).rows.shape == (0, 1)  # and rounded ones
 
 
 @pytest.mark.parametrize("u_target", ["equilibrium", "zero"])

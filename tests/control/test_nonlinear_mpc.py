@@ -309,12 +309,14 @@ def test_the_next_step_starts_from_the_solution_moved_on_by_one_step_multipliers
     for k in range(1, horizon + 2):
         labels += [("gap", k, i) for i in range(2) if k <= horizon]
         labels += [("path", k - 1, i) for i in range(npath) if k > 1]
-    moved = [labels[i] for i in mpc._solver._shooting._next_g]
+    moved = [labels[i] for i in mpc._step.solver._shooting._next_g]
     assert moved == [(kind, min(k + 1, horizon), i) for kind, k, i in labels]
-    mpc._aim.at(np.zeros(2), np.zeros(2), mpc._last_root, np.inf)
-    start = mpc._solver._shooting.at(np.zeros((horizon, 2)), np.zeros((horizon, 1)))
-    solution = mpc._solver._shooting.solve(np.array([0.5, 0.0]), mpc._aim.stages, mpc._e, start, mpc._problem.inputs)
-    whole = np.hstack([solution.U, solution.X, solution.slacks]) / mpc._solver._shooting._sizes
+    mpc._step.aim.at(np.zeros(2), np.zeros(2), mpc._task.outputs.R_root, np.inf)
+    start = mpc._step.solver._shooting.at(np.zeros((horizon, 2)), np.zeros((horizon, 1)))
+    solution = mpc._step.solver._shooting.solve(
+        np.array([0.5, 0.0]), mpc._step.aim.stages, mpc._step.e, start, mpc._task.problem.inputs
+    )
+    whole = np.hstack([solution.U, solution.X, solution.slacks]) / mpc._step.solver._shooting._sizes
     wanted = np.vstack([whole[1:], whole[-1:]])
     np.testing.assert_allclose(solution.start.v.reshape(horizon, -1), wanted, atol=1e-12)
 
@@ -322,7 +324,7 @@ def test_the_next_step_starts_from_the_solution_moved_on_by_one_step_multipliers
 def test_a_solution_that_is_no_number_in_one_place_is_a_failure():
     mpc = km.NonlinearMPC(pendulum(), km.Cost(Q=[1, 0.1], R=0.1), km.Limits(-1, 1), 4)
     mpc([0.5, 0.0], [0, 0])
-    own = mpc._solver._shooting._solver
+    own = mpc._step.solver._shooting._solver
 
     class Torn:
         stats = own.stats
@@ -332,7 +334,7 @@ def test_a_solution_that_is_no_number_in_one_place_is_a_failure():
             found["x"][3] = np.nan
             return found
 
-    mpc._solver._shooting._solver = Torn()
+    mpc._step.solver._shooting._solver = Torn()
     move = mpc([0.5, 0.0], [0, 0])
     assert move.status is km.Status.FAILED
     assert np.isfinite(move.u).all()

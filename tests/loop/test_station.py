@@ -39,7 +39,7 @@ def loop(controller, steps, r=0.5, x0=0.0, push=0.0, applied=lambda u: u, act=No
 
 def test_a_pid_without_limits_is_its_transfer_function():
     kp, ki, kd, filter_time, dt = 2.0, 0.7, 0.3, 0.25, 0.1
-    pid = km.control.PID(kp, ki, kd, dt=dt, filter_time=filter_time, b=1.0, c=1.0)
+    pid = km.control.PID(kp, ki, kd, dt=dt, options=km.control.PIDOptions(filter_time=filter_time, b=1.0, c=1.0))
     error = np.random.default_rng(0).standard_normal(60)
     u = [float(pid([-e], [0.0]).u[0]) for e in error]
     integral = scipy.signal.lfilter([0.0, ki * dt], [1.0, -1.0], error)
@@ -127,7 +127,7 @@ def test_a_bad_measurement_holds_the_input_of_a_pid():
 @given(st.floats(-0.9, 0.9), st.floats(0.1, 5), st.floats(0.1, 5), st.floats(0, 1))
 @settings(max_examples=30, deadline=None)
 def test_at_rest_a_switch_to_a_pid_moves_nothing(hand, kp, ki, b):
-    pid = km.control.PID(kp, ki, dt=0.1, limits=BOX, b=b)
+    pid = km.control.PID(kp, ki, dt=0.1, limits=BOX, options=km.control.PIDOptions(b=b))
     station = km.supervise.Station(pid, limits=BOX, mode="manual", hand=[hand])
     rest = 2.0 * hand
     station.reset()

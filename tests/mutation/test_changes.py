@@ -73,7 +73,7 @@ def test_what_stands_in_for_a_divisor_of_zero_and_a_most_of_rounds_stay() -> Non
 
 
 @pytest.mark.parametrize(
-    "name", ["estimate/gate.py", *slow(["control/lqr.py", "data/files/parquet.py", "loop/simulate.py"])]
+    "name", ["estimate/gate.py", *slow(["control/kinds/lqr.py", "data/files/parquet.py", "loop/simulate.py"])]
 )
 def test_every_change_of_the_library_is_a_program_that_differs(name: str) -> None:
     source = (Path(__file__).parents[2] / "koopmpc" / name).read_bytes()
@@ -84,7 +84,7 @@ def test_every_change_of_the_library_is_a_program_that_differs(name: str) -> Non
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_change_stays_drawn_when_its_line_moves_and_when_others_come_and_go(seed: int) -> None:
-    path, moved = Path(__file__).parents[2] / "koopmpc/control/lqr.py", b"def more(a):\n    return a + 2\n\n\n"
+    path, moved = Path(__file__).parents[2] / "koopmpc/control/kinds/lqr.py", b"def more(a):\n    return a + 2\n\n\n"
 
     def drawn(name: str, source: bytes, count: int) -> list[tuple[str, str]]:
         everything = [(mutant, "\n".join(mutant.lines(source))) for mutant in mutants(name, source)]

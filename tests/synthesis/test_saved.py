@@ -29,7 +29,7 @@ def controllers():
         km.supervise.Guarded(
             km.KoopmanMPC(linear, COST, LIMITS, 9, monitor=data()), km.LQR(linear, COST, LIMITS), patience=2
         ),
-        km.control.PID([2.0], [0.5], [0.1], dt=linear.dt, limits=LIMITS, b=0.5),
+        km.control.PID([2.0], [0.5], [0.1], dt=linear.dt, limits=LIMITS, options=km.control.PIDOptions(b=0.5)),
         km.supervise.Station(
             km.KoopmanMPC(linear, COST, LIMITS, 9), km.LQR(linear, COST, LIMITS), limits=LIMITS, ramp=[0.5, 1.0]
         ),

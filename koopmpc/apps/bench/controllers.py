@@ -23,7 +23,7 @@ from koopmpc.control.function import as_controller
 from koopmpc.control.kinds import BenchEntry, list_bench
 from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear.equilibrium import Equilibria
-from koopmpc.control.nonlinear.learned_map import learned_map
+from koopmpc.control.nonlinear.stages import learned_map
 from koopmpc.control.plan.tracking import state_tracking
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episodes
@@ -204,7 +204,7 @@ class Prepared:
 
         @cache
         def search(*w: float) -> Equilibria:
-            return Equilibria(learned_map(plant.at(w) if w else plant), problem.cost, seen)
+            return Equilibria(learned_map(plant.at(w) if w else plant), seen)
 
         distinct, of = np.unique(np.hstack([W, rows]), axis=0, return_inverse=True)
         held = [(search(*each[: plant.nw]), each[plant.nw :]) for each in distinct]

@@ -4,7 +4,7 @@ Its variables w are defined by δx = δx_free + x̃ and δu_k = δu_free,k − K
 S_k = R + BᵀP_{k+1}B = L_k L_kᵀ. The cost is that of the program without limits plus ½ ‖w‖².
 """
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,7 +14,8 @@ from koopmpc.control.ask.limits import Interval, Softness
 from koopmpc.control.move import Status
 from koopmpc.control.riccati import Stage, step
 from koopmpc.control.solvers import FINISHER
-from koopmpc.control.solvers.base import QP
+from koopmpc.control.solvers.base import QP, SolverTurn, StepQP
+from koopmpc.control.solvers.levels import LevelSearch, LevelSolver
 
 FINISHED = 150  # about as many interior-point steps take as long as an active-set method
 
@@ -57,22 +58,6 @@ class StageStep(NamedTuple):
     def effort(self) -> int:
         """What the program cost, in interior-point steps; rounding decides nothing of it."""
         return FINISHED if self.finished else self.iterations
-
-
-@runtime_checkable
-class SearchesLevels(Protocol):
-    """What solves the program of the stages with inputs on levels."""
-
-    def solve(
-        self,
-        stages: Stages,
-        free: Float[np.ndarray, "N nq"],
-        limits: Interval,
-        softness: Softness,
-        deadline: float,
-    ) -> Deviation | None:
-        """Return the least deviation from the solution without limits; None where it has no digits left."""
-        ...
 
 
 def condense_stages(
@@ -133,3 +118,77 @@ def least_deviation(
     y = np.zeros(len(linear)) if multipliers is None else multipliers
     found = FINISHER(qp).solve(none, y, seconds if np.isfinite(seconds) else None)
     return Deviation(X[1:] @ found.v, U @ found.v, found.y, found.status, found.iterations)
+
+
+class StageLevels:
+    """The search over levels in the quadratic programs of a BilinearMPC.
+
+    Parameters
+    ----------
+    search
+        The levels, and those of the last plan.
+    rated
+        Whether v is the change of the inputs.
+    """
+
+    def __init__(self, search: LevelSearch, *, rated: bool) -> None:
+        self.search, self._rated = search, rated
+        self._solver: LevelSolver | None = None
+
+    def solve(
+        self,
+        stages: Stages,
+        free: Float[np.ndarray, "N nq"],
+        limits: Interval,
+        softness: Softness,
+        deadline: float,
+    ) -> Deviation | None:
+        """Return the least deviation from the solution without limits; None where the recursion has no digits left.
+
+        `free` are the values [U_k; g(X_{k+1})] of that solution, `limits` those of the same values.
+        """
+        condensed = condense_stages(stages)
+        if condensed is None:
+            return None
+        X, U, rows = condensed
+        nu, n = U.shape[1:]
+        starts = np.flatnonzero(stages.free)
+        first = nu if self._rated else 0
+        mine = slice(first, first + nu)  # where u_k stands among the values of a stage
+        kept = np.isfinite(limits.low) | np.isfinite(limits.high)
+        kept[~stages.free, :nu] = False
+        kept[:, mine] = False
+        low = np.maximum.reduceat(limits.low[:, mine], starts, axis=0).ravel()
+        high = np.minimum.reduceat(limits.high[:, mine], starts, axis=0).ravel()
+        moves = np.isfinite(low) | np.isfinite(high)
+        A = np.concatenate([rows[starts, mine].reshape(-1, n)[moves], rows[kept]])
+        if not np.isfinite(A).all():
+            return None
+        none = np.zeros(nu * len(starts)), np.full(nu * len(starts), np.inf)
+        prices = [
+            np.concatenate([none[hard][moves], np.tile(part, (len(rows), 1))[kept]])
+            for part, hard in zip(softness, (1, 0, 0), strict=True)
+        ]
+        source = np.concatenate([np.flatnonzero(moves), len(low) + np.arange(int(kept.sum()))])
+        qp = StepQP(
+            P=np.eye(n),
+            q=np.zeros((n,)),
+            A=A,
+            low=np.concatenate([low[moves], limits.low[kept]]),
+            high=np.concatenate([high[moves], limits.high[kept]]),
+            softness=Softness(*prices),
+            source=source,
+            scale=np.ones(len(source)),
+            shift_primal=np.arange(int(n)),
+            shift_dual=np.arange(len(source)),
+            rate_rows=np.zeros(0, np.intp),
+            rate_inputs=np.zeros(0, np.intp),
+        )
+        if self._solver is None or self._solver.qp.source.tolist() != source.tolist():
+            self._solver = LevelSolver(qp, SolverTurn(FINISHER, {}), self.search)
+        else:
+            self._solver.update(qp)
+        plan = np.concatenate([free[starts, mine].ravel(), free[kept]])
+        end = None if np.isinf(deadline) else deadline
+        found, _ = self._solver.solve(plan, None, end, Interval(qp.low, qp.high))
+        return Deviation(X[1:] @ found.v, U @ found.v, found.y, found.status, found.iterations)

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.base.checks import HUGE
-from koopmpc.control.ask.limits import Interval
-from koopmpc.control.ask.terminal import TerminalSet, terminal_feedback
-from koopmpc.control.nonlinear.learned_map import LearnedMap
-from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
+from koopmpc.base.values import Interval
+from koopmpc.control.ask.limits import Limits
+from koopmpc.control.ask.terminal import TerminalSet, read_terminal_set, terminal_feedback
+from koopmpc.control.nonlinear.stages import LearnedMap, StagedProblem, StageTargets
 from koopmpc.control.nonlinear.stagewise import plan_cost
 
 _BROKEN = 1.0  # a plan is accepted that breaks no hard limit by more than this many allowances
@@ -121,6 +121,14 @@ class PlanKeeper:
         slack = float(soft[over[:, ~self._hard] > 1].max(initial=0.0))
         parts = (S.T, V.T, targets.R.T, targets.U.T, targets.M, targets.L, targets.m, *self._stage_limits)
         return JudgedPlan(U, S, V, float(self._cost(*parts)), excess, slack)
+
+
+def make_keeper(problem: StagedProblem, model: LearnedMap, limits: Limits) -> PlanKeeper | None:
+    """Return what keeps the accepted plan; None where the set is soft or has no feedback, or moves are not free."""
+    end = None if limits.terminal is None else read_terminal_set(limits.terminal)
+    if end is None or end.feedback is None or limits.terminal_slack is not None:
+        return None
+    return PlanKeeper(problem, model, end) if problem.free.all() and not (problem.own or problem.timed) else None
 
 
 def choose_plan(found: JudgedPlan | None, kept: JudgedPlan | None) -> JudgedPlan | None:

@@ -8,13 +8,15 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.base.checks import HUGE
-from koopmpc.control.ask.limits import SOFTENED, Interval
+from koopmpc.base.values import Interval
+from koopmpc.control.ask.bounds import SOFTENED
 from koopmpc.control.move import Status
+from koopmpc.control.nonlinear.condensed_stages import StageLevels
 from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
-from koopmpc.control.nonlinear.learned_map import LearnedMap
-from koopmpc.control.nonlinear.level_stages import StageLevels
-from koopmpc.control.nonlinear.plan_solver import GOOD, PlanSolver, PlanStart, StagePlan
+from koopmpc.control.nonlinear.stages import LearnedMap
+from koopmpc.control.nonlinear.task import StagedTask
 from koopmpc.control.solvers.levels import LevelSearch
+from koopmpc.control.step.staged import GOOD, PlanSolver, PlanStart, StagePlan
 from koopmpc.plants.step_map import StepMap
 
 SETTLED = 1e-6  # a plan is a solution when no input and no state moves by more than this share of its size
@@ -40,6 +42,9 @@ class _Effort:
         Begin a new plan if y is more than this many state sizes from the expected state.
     met
         A plan ends in its terminal set if the value of the set is at most this much above 1.
+    passes, on_model
+        Linearisations with levels, at most; fewer if the plan misses each state of the model by less than this share of
+        its size.
     """
 
     each: int = 12
@@ -50,6 +55,8 @@ class _Effort:
     followed: float = 0.02
     far: float = 3.0
     met: float = 1e-8
+    passes: int = 4
+    on_model: float = 1e-6
 
 
 EFFORT = _Effort()
@@ -60,10 +67,8 @@ class RealTimeSolver(PlanSolver):
 
     Parameters
     ----------
-    iteration, model
-        One linearisation and its quadratic program, and the map.
-    inputs
-        The widest limits of the inputs.
+    iteration, task
+        One linearisation and its quadratic program, and what is asked.
     sqp_iterations
         Linearisations a step.
     levels
@@ -71,22 +76,13 @@ class RealTimeSolver(PlanSolver):
     """
 
     def __init__(
-        self,
-        iteration: RealTimeIteration,
-        model: LearnedMap,
-        inputs: Interval,
-        sqp_iterations: int,
-        levels: LevelSearch | None,
+        self, iteration: RealTimeIteration, task: StagedTask, sqp_iterations: int, levels: LevelSearch | None
     ) -> None:
-        self.iteration, self._problem, self._inputs, self._sqp_iterations = (
-            iteration,
-            iteration.problem,
-            inputs,
-            sqp_iterations,
-        )
+        self.iteration, self._problem, self._sqp_iterations = iteration, task.problem, sqp_iterations
+        self._inputs = task.outputs.inputs
         self._spent = 0  # effort of the solver in this step
-        self._on_levels = None if levels is None else StageLevels(levels, iteration.problem)
-        self.update(model)
+        self._on_levels = None if levels is None else StageLevels(levels, rated=task.problem.with_rates)
+        self.update(task.map)
 
     def update(self, model: LearnedMap) -> None:
         """Go on with another θ."""
@@ -132,7 +128,7 @@ class RealTimeSolver(PlanSolver):
             status, more = self._meet_end(status, start)
             iterations += more
         if self._on_levels is not None and status in GOOD and not self._rests_on_levels(start.box):
-            status, more = self._on_levels.improve(iteration, start.s, start.targets, start.deadline)
+            status, more = self._put_on_levels(self._on_levels, start)
             iterations += more
         free = iteration.without_limits + (start.u_prev if self._problem.with_rates else 0.0)
         return StagePlan(iteration.X, iteration.U, status, iterations, iteration.slack, free)
@@ -141,6 +137,33 @@ class RealTimeSolver(PlanSolver):
         """Return whether the plan is on levels although it was found without them."""
         U = self._problem.leave(self.iteration.X, self.iteration.U, box)[1]
         return self._on_levels is not None and self._on_levels.search.accepts(U[self._problem.free].ravel())
+
+    def _put_on_levels(self, levels: StageLevels, start: PlanStart) -> tuple[Status, int]:
+        """Put the plan on levels; return how that ended, and the solver's iterations.
+
+        Each pass linearises at the plan of the last one, and they end where the levels stay.
+        """
+        iteration, search, total, kept, broken = self.iteration, levels.search, 0, None, 0.0
+        for _ in range(EFFORT.passes):
+            found = iteration.step(start.s, start.targets, start.deadline, levels)
+            total += found.iterations
+            if found.status is not Status.OPTIMAL:
+                search.repeats = False
+                if kept is None:
+                    return found.status, total
+                search.index, search.gap = kept
+                break
+            same = kept is not None and bool((kept[0] == search.index).all())
+            kept = search.index, search.gap
+            iteration.X[0] = start.s
+            iteration.X[1:] += found.X
+            iteration.U += found.U
+            broken = iteration.note_slack(found)
+            if same or iteration.find_defect() < EFFORT.on_model:
+                break
+            search.repeats = True
+        search.repeats = False
+        return Status.SOFTENED if broken else Status.OPTIMAL, total
 
     def _meet_limits(self, status: Status, start: PlanStart) -> tuple[Status, int]:
         """Linearise on until the plan keeps its hard limits; return how it ended, and the solver's iterations."""

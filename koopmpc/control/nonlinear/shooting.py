@@ -12,9 +12,9 @@ from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.control.ask.limits import SOFTENED, Interval
 from koopmpc.control.move import Status
-from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.nonlinear.ranges import find_undefined_operation
-from koopmpc.control.nonlinear.stagewise import weight_symbols
+from koopmpc.control.nonlinear.stages import StagedProblem, StageTargets
+from koopmpc.control.nonlinear.stagewise import sum_costs, target_symbols, weight_symbols
 
 NLPSolver = Literal["ipopt", "fatrop", "sqpmethod"]
 OPTIONS: Mapping[str, Mapping[str, Any]] = {
@@ -108,71 +108,74 @@ class Shooting:
         settings: Mapping[str, Any],
         timed: bool = False,
     ) -> None:
-        p, N = problem, len(problem.free)
-        nx, nu, nr, ng = p.nx, p.F.size1_in(1), len(p.Q), len(p.box.low)
-        moved = p.moved
-        x, u = ca.MX.sym("x", nx), ca.MX.sym("u", nu)
-        w = ca.MX.sym("w", p.scheduled)
-        matrices = ca.vertcat(ca.MX(ca.DM(theta[: len(theta) - p.scheduled])), w)
-        F, smooth = ca.Function("F", [x, u, w], [p.F(x, u, matrices)]), p.F.is_a("SXFunction")
-        F = F.expand() if smooth else F
-        linear, quadratic, allowance = p.softness
-        soft = np.flatnonzero(np.isfinite(linear))
-        ns = len(soft)
-        self.allowance, row = allowance[soft], allowance / SOFTENED
+        p, (N, nu), ng = problem, problem.held_from.shape, len(problem.box.low)
+        F, smooth = _fix_theta(p, theta), p.F.is_a("SXFunction")
+        soft = np.flatnonzero(np.isfinite(p.softness.linear))
+        ns, row = len(soft), p.softness.allowance / SOFTENED
+        self.allowance, self._path_row, self._scale = p.softness.allowance[soft], row, p.scale
         self._sizes = np.concatenate([p.input_sizes, p.sizes, row[soft]])
-        W = ca.MX.sym("W", nu + nx + ns, N)
-        whole = ca.DM(self._sizes) * W
-        U, X, E = whole[:nu, :], whole[nu : nu + nx, :], whole[nu + nx :, :]
-        sizes = ((nx, 1), (nr, N), (nu, N), (moved, N), (p.scheduled, N))
-        x0, r, u_r, e, schedule = (ca.MX.sym("p", *size) for size in sizes)
-        M, L, m = (ca.MX.sym("terminal", nx + nr, columns) for columns in (nr, nx, 1))
-
-        # gap_1; gap_2, path_1; …; gap_N, path_{N−1}; path_N, the order in which fatrop finds the stages, with its sign
-        ahead = F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U, schedule) + ca.vertcat(e, ca.MX(nx - moved, N))
-        gaps = W[nu : nu + nx, :] - ahead / ca.DM(p.sizes)
-        end = M @ p.tracked(X[:, N - 1]) + L @ X[:, N - 1] - m
-        Q_d, R_d = weight_symbols(p)
-        self.weights = np.tile(p.Q.diagonal(), (N, int(p.timed))), np.tile(p.R.diagonal(), (N, int(R_d.numel() > 0)))
-        f = (ca.dot(U - u_r, R_d * (U - u_r)) if R_d.numel() else _weigh(U - u_r, p.R)) + ca.sumsqr(end)
-        if N > 1:
-            missed = p.tracked.map(N - 1)(X[:, : N - 1]) - r[:, : N - 1]
-            f += ca.dot(missed, Q_d[:, : N - 1] * missed) if p.timed else _weigh(missed, p.Q)
-        if p.stage is not None:
-            f += ca.sum2(p.stage.map(N)(ca.horzcat(x0, X[:, : N - 1]), U))
-        path, low, high = ca.MX(0, N), np.zeros(0), np.zeros(0)
-        if ng:
-            values, infinite = p.limited.map(N)(X), np.full(ng, np.inf)
-            relaxed = ca.DM(np.eye(ng)[:, soft]) @ E if ns else ca.MX(ng, N)
-            if ns:
-                f += ca.sum2(ca.DM(linear[soft]).T @ E + ca.DM(quadratic[soft]).T @ E**2)
+        self._moves_at = nu + p.moved if p.with_rates else 0  # the first column of u_k among the variables of a stage
+        self._shape, self._split = (N, len(self._sizes)), (nu, nu + p.nx)
+        W = ca.MX.sym("W", len(self._sizes), N)
+        U, X, E = ca.vertsplit(ca.DM(self._sizes) * W, [0, *self._split, len(self._sizes)])
+        x0, e, schedule = (ca.MX.sym("p", *size) for size in ((p.nx, 1), (p.moved, N), (p.scheduled, N)))
+        targets, diagonals, states = target_symbols(p), weight_symbols(p), ca.horzcat(x0, X)
+        self.weights = tuple(
+            np.tile(full.diagonal(), (N, int(given.numel() > 0)))
+            for full, given in zip((p.Q, p.R), diagonals, strict=True)
+        )
+        f = sum_costs(p, states, U, targets, diagonals)
+        ahead = F.map(N)(states[:, :N], U, schedule) + ca.vertcat(e, ca.MX(p.nx - p.moved, N))
+        gaps, path = W[nu : nu + p.nx, :] - ahead / ca.DM(p.sizes), ca.MX(0, N)
+        if ng:  # values − ε ≤ high; values + ε ≥ low
+            values, relaxed = p.limited.map(N)(X), ca.DM(np.eye(ng)[:, soft]) @ E if ns else ca.MX(ng, N)
             path = ca.vertcat(values - relaxed, values + relaxed) / ca.DM(np.tile(row, 2))
-            low, high = np.concatenate([-infinite, p.box.low / row]), np.concatenate([p.box.high / row, infinite])
-        npath = path.shape[0]
-        g = [
-            gaps[:, k] if part == 0 else path[:, k - part]
-            for k in range(N + 1)
-            for part in (0, 1)
-            if part <= k < N + part and (npath or part == 0)
-        ]
-        places = np.arange(N)[:, None] * (nx + npath)
-        gap_at = places - npath + np.arange(nx)
-        gap_at[0] += npath
-        path_at = places + nx + nx + np.arange(npath)
+        if ns:
+            linear, quadratic = (ca.DM(weight[soft]) for weight in p.softness[:2])
+            f += ca.sum2(linear.T @ E + quadratic.T @ E**2)
+        self._bound(p, ns)
+        given = [x0, *targets[:2], e, *targets[2:], schedule, *diagonals]
+        nlp = {"x": ca.vec(W), "p": ca.veccat(*given), "f": f / p.scale, "g": _stack(gaps, path)}
+        options: dict[str, Any] = {"expand": smooth, "error_on_fail": False, "print_time": False}
+        self._start_is_number: ca.Function | None = None
+        if solver == "fatrop":
+            _demand_numbers(F, p.tracked, p.limited, *(() if p.stage is None else (p.stage,)))
+            self._start_is_number = _is_number(nlp)
+            ends = {"nx": [0] + [p.nx] * N, "nu": [nu] + [ns + nu] * (N - 1) + [ns], "ng": [0] + [2 * ng] * N}
+            options |= {"N": N, **ends}
+        self._clock = _Clock(W.numel(), nlp["g"].numel()) if timed and solver != "fatrop" else None
+        if self._clock is not None:
+            options["iteration_callback"] = self._clock
+        try:
+            with raise_swallowed():
+                self._solver = ca.nlpsol("shooting", solver, nlp, {**_QUIET, **OPTIONS[solver], **options, **settings})
+        except (RuntimeError, NotImplementedError, TypeError) as error:
+            reason = [line for line in str(error).splitlines() if line.strip()][-1].strip()
+            raise DataError(
+                f"{solver} was not built with settings {dict(settings)}: {reason}; pass its own settings by CasADi's "
+                'names, for example {"ipopt.tol": 1e-8}'
+            ) from error
+
+    def _bound(self, p: StagedProblem, ns: int) -> None:
+        """Set the bounds of the variables and of the constraints (see `_stack`), and how both are shifted."""
+        (N, nu), nx, ng = p.held_from.shape, p.nx, len(p.box.low)
+        places, path = np.arange(N)[:, None] * (nx + 2 * ng), 2 * ng
+        gap_at = places - path + np.arange(nx)
+        gap_at[0] += path
+        path_at = places + nx + nx + np.arange(path)
         path_at[-1] -= nx
-        self._next_g = np.empty(N * (nx + npath), dtype=np.intp)
+        self._path_at = path_at
+        self._next_g = np.empty(N * (nx + path), dtype=np.intp)
         for at in (gap_at, path_at):
             self._next_g[at] = np.vstack([at[1:], at[-1:]])
-        stages = np.arange(W.numel()).reshape(N, -1)
+        stages = np.arange(N * len(self._sizes)).reshape(N, -1)
         self._next_v = np.vstack([stages[1:], stages[-1:]]).ravel()
         lbg, ubg = np.zeros(len(self._next_g)), np.zeros(len(self._next_g))
-        lbg[path_at], ubg[path_at] = low, high
-        if ng:  # [values − ε ≤ high; values + ε ≥ low], the last outputs of each moved inwards
-            last, share = path_at[:, ng - p.margin.shape[1] : ng], p.margin / row[ng - p.margin.shape[1] :]
-            ubg[last] -= share
-            lbg[last + ng] += share
-            if p.ends:  # a terminal set limits the last stage alone
-                ubg[path_at[:-1, ng - p.ends : ng]] = np.inf
+        outputs, infinite = p.stage_limits, np.full((N, ng), np.inf)
+        lbg[path_at] = np.hstack([-infinite, outputs.low[:, nu:] / self._path_row])
+        ubg[path_at] = np.hstack([outputs.high[:, nu:] / self._path_row, infinite])
+        if p.ends:  # a terminal set limits the last stage alone
+            ubg[path_at[:-1, ng - p.ends : ng]] = np.inf
         unlimited = np.full(nx, np.inf)
         lbx = np.tile(np.concatenate([p.inputs.low, -unlimited, np.zeros(ns)]), (N, 1))
         ubx = np.tile(np.concatenate([p.inputs.high, unlimited, np.full(ns, np.inf)]), (N, 1))
@@ -181,34 +184,6 @@ class Shooting:
         lbx[held] = ubx[held] = 0.0
         lbx, ubx = lbx / self._sizes, ubx / self._sizes
         self._bounds = {"lbx": lbx.ravel(), "ubx": ubx.ravel(), "lbg": lbg, "ubg": ubg}
-        parameters = ca.veccat(x0, r, u_r, e, M, L, m, schedule, Q_d, R_d)
-        nlp = {"x": ca.vec(W), "p": parameters, "f": f / p.scale, "g": ca.vertcat(*g)}
-        given: dict[str, Any] = {"expand": smooth, "error_on_fail": False, "print_time": False}
-        self._start_is_number: ca.Function | None = None
-        if solver == "fatrop":
-            _demand_numbers(F, p.tracked, p.limited, *(() if p.stage is None else (p.stage,)))
-            self._start_is_number = _is_number(nlp)
-            given |= {
-                "N": N,
-                "nx": [0] + [nx] * N,
-                "nu": [nu] + [ns + nu] * (N - 1) + [ns],
-                "ng": [0] + [npath] * N,
-            }
-        self._clock = _Clock(W.numel(), len(lbg)) if timed and solver != "fatrop" else None
-        if self._clock is not None:
-            given["iteration_callback"] = self._clock
-        try:
-            with raise_swallowed():
-                self._solver = ca.nlpsol("shooting", solver, nlp, {**_QUIET, **OPTIONS[solver], **given, **settings})
-        except (RuntimeError, NotImplementedError, TypeError) as error:
-            reason = [line for line in str(error).splitlines() if line.strip()][-1].strip()
-            raise DataError(
-                f"{solver} was not built with settings {dict(settings)}: {reason}; pass its own settings by CasADi's "
-                'names, for example {"ipopt.tol": 1e-8}'
-            ) from error
-        self._scale, self._path_at, self._path_row = p.scale, path_at, row
-        self._moves_at = nu + moved if p.with_rates else 0  # the first column of u_k among the variables of a stage
-        self._shape, self._split = (N, nu + nx + ns), (nu, nu + nx)
 
     def set_limits(self, inputs: Interval, outputs: Interval) -> None:
         """Set the limits (N, nu) of the inputs of all stages, and those (N, ng) of their outputs."""
@@ -344,6 +319,17 @@ def _is_number(nlp: Mapping[str, ca.MX]) -> ca.Function:
     return ca.Function("is_number", [v, nlp["p"]], [size < ca.inf])
 
 
-def _weigh(columns: ca.MX, Q: Float[np.ndarray, "n n"]) -> ca.MX:
-    """Return Σ over columns of eᵀQe."""
-    return ca.sum1(ca.sum2(columns * ca.mtimes(ca.DM(Q), columns)))
+def _fix_theta(p: StagedProblem, theta: Float[np.ndarray, " nt"]) -> ca.Function:
+    """Return (x, u, w) → F with this θ."""
+    x, u, w = ca.MX.sym("x", p.nx), ca.MX.sym("u", len(p.R)), ca.MX.sym("w", p.scheduled)
+    F = ca.Function("F", [x, u, w], [p.F(x, u, ca.vertcat(ca.MX(ca.DM(theta[: len(theta) - p.scheduled])), w))])
+    return F.expand() if p.F.is_a("SXFunction") else F
+
+
+def _stack(gaps: ca.MX, path: ca.MX) -> ca.MX:
+    """Return gap_1; gap_2, path_1; …; gap_N, path_{N−1}; path_N, the order in which fatrop finds the stages."""
+    N = gaps.shape[1]
+    parts = [gaps[:, 0]]
+    for k in range(1, N):
+        parts += [gaps[:, k], path[:, k - 1]]
+    return ca.vertcat(*parts, path[:, N - 1])

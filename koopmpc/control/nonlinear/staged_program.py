@@ -12,10 +12,9 @@ from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.control.ask.limits import Interval, Softness
 from koopmpc.control.nonlinear.equilibrium import RestProgram
-from koopmpc.control.nonlinear.learned_map import LearnedMap, ModelOrMap
-from koopmpc.control.nonlinear.problem import StagedProblem
-from koopmpc.control.nonlinear.rows import StageBounds
+from koopmpc.control.nonlinear.stages import LearnedMap, ModelOrMap, StagedProblem
 from koopmpc.control.nonlinear.stagewise import Sides
+from koopmpc.control.nonlinear.task import StageBounds
 from koopmpc.control.plan.row_targets import RowTargets, TailProgram
 from koopmpc.control.plan.tracking import StateTracking
 from koopmpc.control.program import StepProgram, trace_graph

@@ -10,14 +10,16 @@ Rao, Wright & Rawlings, "Application of interior-point methods to model predicti
 Appl. 99, 1998; Mehrotra, "On the implementation of a primal-dual interior point method", SIAM J. Optim. 2, 1992.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.control.ask.limits import SOFTENED, Interval, Softness, half_width
-from koopmpc.control.nonlinear.problem import StagedProblem
+from koopmpc.base.values import Interval
+from koopmpc.control.ask.bounds import SOFTENED, Softness, half_width
+from koopmpc.control.nonlinear.stages import StagedProblem
 
 _SHORT = 0.995  # share of the way to the nearest bound
 
@@ -134,22 +136,39 @@ def list_hard_outputs(softness: Softness, inputs: int) -> Int[np.ndarray, " n"]:
     return hard[hard >= inputs]
 
 
+def sum_costs(
+    problem: StagedProblem, X: ca.MX, U: ca.MX, targets: Sequence[ca.MX], diagonals: tuple[ca.MX, ca.MX]
+) -> ca.MX:
+    """Return what states X (nx, N+1) and inputs U cost at targets R, U_r, M, L, m, but for soft limits.
+
+    `diagonals` are those of `weight_symbols`.
+    """
+    N, (R, U_r, M, L, m), (Q_d, R_d) = len(problem.free), targets, diagonals
+    of, moved = problem.tracked.map(N)(X[:, 1:]), U - U_r
+    missed = (of - R)[:, : N - 1]
+    cost = ca.sumsqr(M @ of[:, N - 1] + L @ X[:, N] - m)
+    cost += ca.dot(moved, R_d * moved if R_d.numel() else ca.DM(problem.R) @ moved)
+    cost += ca.dot(missed, Q_d[:, : N - 1] * missed if problem.timed else ca.DM(problem.Q) @ missed)
+    return cost if problem.stage is None else cost + ca.sum2(problem.stage.map(N)(X[:, :N], U))
+
+
+def target_symbols(problem: StagedProblem) -> list[ca.MX]:
+    """Return R, U_r, M, L, m of `StageTargets`, stage beside stage."""
+    nx, nr, N = problem.nx, len(problem.Q), len(problem.free)
+    ends = [ca.MX.sym("terminal", nx + nr, columns) for columns in (nr, nx, 1)]
+    return [ca.MX.sym("R", nr, N), ca.MX.sym("U_r", len(problem.R), N), *ends]
+
+
 def plan_cost(problem: StagedProblem) -> ca.Function:
     """Return (X, U, R, U_r, M, L, m, low, high) → the cost of a plan, with what it pays for breaking soft limits.
 
     The limits are those of [u_k; g(x_{k+1})], stage beside stage.
     """
-    nx, nu, nr, N = problem.nx, len(problem.R), len(problem.Q), len(problem.free)
-    X, U = ca.MX.sym("X", nx, N + 1), ca.MX.sym("U", nu, N)
-    R, U_r = ca.MX.sym("R", nr, N), ca.MX.sym("U_r", nu, N)
-    M, L, m = (ca.MX.sym("terminal", nx + nr, columns) for columns in (nr, nx, 1))
+    nx, nu, N = problem.nx, len(problem.R), len(problem.free)
+    X, U, targets = ca.MX.sym("X", nx, N + 1), ca.MX.sym("U", nu, N), target_symbols(problem)
     low, high = (ca.MX.sym("end", nu + len(problem.box.low), N) for _ in range(2))
-    of, moved = problem.tracked.map(N)(X[:, 1:]), U - U_r
-    missed = (of - R)[:, : N - 1]
-    Q_d, R_d = weight_symbols(problem)
-    cost = ca.sumsqr(M @ of[:, N - 1] + L @ X[:, N] - m)
-    cost += ca.dot(moved, R_d * moved if R_d.numel() else ca.DM(problem.R) @ moved)
-    cost += ca.dot(missed, Q_d[:, : N - 1] * missed if problem.timed else ca.DM(problem.Q) @ missed)
+    diagonals = weight_symbols(problem)
+    cost = sum_costs(problem, X, U, targets, diagonals)
     if len(problem.box.low):
         soft = np.isfinite(problem.softness.linear)
         linear, quadratic = (ca.DM(np.where(soft, weight, 0.0)) for weight in problem.softness[:2])
@@ -160,10 +179,7 @@ def plan_cost(problem: StagedProblem) -> ca.Function:
             counts[-problem.ends :, :-1] = 0.0
             over = over * ca.DM(counts)
         cost += ca.dot(linear, ca.sum2(over)) + ca.dot(quadratic, ca.sum2(over**2))
-    if problem.stage is not None:
-        cost += ca.sum2(problem.stage.map(N)(X[:, :N], U))
-    arguments = [X, U, R, U_r, M, L, m, low, high, *([Q_d, R_d] if problem.timed else [])]
-    return ca.Function("plan_cost", arguments, [cost])
+    return ca.Function("plan_cost", [X, U, *targets, low, high, *(diagonals if problem.timed else [])], [cost])
 
 
 def simulation(problem: StagedProblem) -> ca.Function:

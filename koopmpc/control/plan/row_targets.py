@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import ShapeError
 from koopmpc.base.values import Value
-from koopmpc.control.ask.cost import Cost
-from koopmpc.control.nonlinear.equilibrium import MISSED, Equilibria, Equilibrium
-from koopmpc.control.nonlinear.learned_map import LearnedMap
+from koopmpc.control.nonlinear.equilibrium import CLOSE, MISSED, Equilibria, Equilibrium, Response
+from koopmpc.control.nonlinear.stages import LearnedMap
 from koopmpc.control.plan.tracking import StateTracking
 from koopmpc.control.riccati import one_step, stationary
 from koopmpc.control.terminal_cost import tail_of, tail_stage
+from koopmpc.lifting.state import State
 
 PSEUDO = 1e-9  # singular values of the tracked outputs' slopes below this share of the largest count as zero
 _BESIDE = 0.3  # rows are close to each other within this share of a row's size
@@ -102,13 +102,14 @@ class RowTargets:
         Q_N weighs neither states nor what the cost tracks.
     """
 
-    def __init__(self, model: LearnedMap, cost: Cost, outputs: StateTracking, most: int) -> None:
-        self._cost, self._outputs, self._most, nr = cost, outputs, most, len(outputs.Q)
-        self.equilibria = Equilibria(model, cost, outputs)
+    def __init__(self, model: LearnedMap, outputs: StateTracking, most: int) -> None:
+        cost, self._outputs, self._most, nr = outputs.cost, outputs, most, len(outputs.Q)
         self.ends_given = cost.Q_N is not None
         self.holds = isinstance(cost.u_target, str) and cost.u_target == "equilibrium"
         Q_N = cast("ArrayLike | None", cost.Q_N)
-        _check_end(Q_N, nr, of_state=self.equilibria.of_state)
+        of_state = isinstance(cost.of, State) and cost.of.selects_all
+        _check_end(Q_N, nr, of_state=of_state)
+        self.equilibria = Equilibria(model, outputs)
         self._end_root = None if Q_N is None else checks.root(checks.weight(Q_N, "Q_N", nr))
         self._known: dict[tuple[bytes, bytes], RowTarget] = {}
         self._map, self._w = model, np.zeros(model.nw)
@@ -125,7 +126,7 @@ class RowTargets:
         changes = np.zeros_like(o.R) if o.R_delta is None else o.R_delta
         end = np.zeros((nr, nr)) if self._end_root is None else self._end_root
         R, R_delta = (weight * np.outer(su, su) / scale for weight in (o.R, changes))
-        return TailProgram(self._cost.tail or 0, size, scale, o.Q * np.outer(size, size) / scale, R, R_delta, end)
+        return TailProgram(o.cost.tail or 0, size, scale, o.Q * np.outer(size, size) / scale, R, R_delta, end)
 
     def find(self, rows: Sequence[Float[np.ndarray, " nr"]], deadline: float = np.inf) -> tuple[list[RowTarget], bool]:
         """Return the targets of rows, and whether there was no time for all of them.
@@ -167,7 +168,8 @@ class RowTargets:
         """Look again for the equilibria that were not found, and begin as if no row had been asked for."""
         self._known = {key: target for key, target in self._known.items() if target.is_found and not target.w.any()}
         self._last = self._end = None
-        self.schedule(np.zeros_like(self._w))
+        if self._w.any():
+            self.schedule(np.zeros_like(self._w))
 
     def update(self, model: LearnedMap) -> None:
         """Go on with another θ: the last target is searched again, from where it was."""
@@ -317,3 +319,87 @@ def _check_end(Q_N: ArrayLike | None, nr: int, *, of_state: bool) -> None:
             f"Q_N has shape {shape}, expected ({nr}, {nr}) of the tracked states; for lifted coordinates let"
             " the cost track the lifting of the model: of=model.lifting, with references as long"
         )
+
+
+AWAY = 2.0  # an equilibrium at limits may be so many sizes of a state from that of its row
+
+
+class End(NamedTuple):
+    """Where a plan ends: the equilibrium, the reference input there, and the terminal cost."""
+
+    equilibrium: Equilibrium
+    u: Float[np.ndarray, " nu"]
+    cost: TerminalCost
+
+
+class _Chord(NamedTuple):
+    """The Gauss–Newton step from s₀, and the slopes of the limited values [u; g] there on (x, u) by sizes."""
+
+    s: Float[np.ndarray, " n"]
+    response: Response
+    limited: Float[np.ndarray, "nl n"]
+
+
+class MovingEnd:
+    """Row target and e, where x⁺ = F(x, u) + e → End.
+
+    The error that one step leaves is of the square of the change of e, and gone once e rests. The step takes the
+    factors of an earlier one as long as that was close by: repeated, it converges the faster the closer that was, at a
+    fraction of the time.
+    """
+
+    def __init__(self, targets: RowTargets) -> None:
+        self._targets = targets
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin at the target of the row, for it is of another model or of another w."""
+        self._last: Equilibrium | None = None
+        self._chord: _Chord | None = None
+
+    def at(self, target: RowTarget, e: Float[np.ndarray, " nx"]) -> End:
+        """Return the end of a row under e.
+
+        Where no Gauss–Newton steps lead to an equilibrium, or only e makes limits active and the equilibrium is far, as
+        under noise beyond what inputs hold, it is that of the row: ipopt went on to equilibria thousands of sizes away,
+        to which no loop should be led.
+        """
+        search, cost, own = self._targets.equilibria, self._targets.finish_at(target), target.equilibrium
+        begin = own if self._last is None else self._last
+        rest = self._follow(begin, target.row, e) or search.near(begin, target.row, e, CLOSE)
+        if rest is None or not target.is_found or self._is_far(rest, own):
+            self._last = own
+            return End(own, target.u, cost)
+        self._last = rest
+        u = rest.u * self._targets.holds
+        if not self._targets.ends_given:
+            of = search.linearise(rest.x, rest.u).of
+            cost = cost._replace(m=cost.M @ of + cost.L @ rest.x + cost.V @ u)
+        return End(rest, u, cost)
+
+    def _follow(
+        self, begin: Equilibrium, row: Float[np.ndarray, " nr"], e: Float[np.ndarray, " nx"]
+    ) -> Equilibrium | None:
+        """Return the equilibrium by one step from `begin`; None where it is not close, or a limit is active."""
+        if begin.active.any():
+            return None
+        search, nx = self._targets.equilibria, len(begin.x)
+        s, at = np.concatenate([begin.x, begin.u]) / search.size, search.linearise(begin.x, begin.u)
+        close = CLOSE * (1 + np.abs(s).max())
+        if self._chord is None or np.abs(s - self._chord.s).max() > close:
+            nu = len(begin.u)
+            limited = np.zeros((nu + len(at.G), nx + nu))
+            limited[:nu, nx:], limited[nu:, :nx] = np.eye(nu), at.G
+            self._chord = _Chord(s, search.respond(at), limited * search.size)
+        _, (H, T), limited = self._chord
+        step = H @ ((at.F + e - begin.x) / search.size[:nx]) + T @ search.residuals(at, row, s)
+        reached = np.concatenate([begin.u, at.g]) + limited @ step
+        if not np.abs(step).max() <= close or (reached > search.high).any() or (reached < search.low).any():
+            return None
+        x, u = np.split((s + step) * search.size, [nx])
+        return Equilibrium(x, u, begin.active)
+
+    def _is_far(self, rest: Equilibrium, own: Equilibrium) -> bool:
+        """Return whether an equilibrium at limits is several sizes of the state from one that meets them."""
+        away = (np.abs(rest.x - own.x) / self._targets.equilibria.size[: len(own.x)]).max()
+        return bool(rest.active.any() and not own.active.any() and away > AWAY)

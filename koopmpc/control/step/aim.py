@@ -6,94 +6,134 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from koopmpc.base import checks
-from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibrium, Response
-from koopmpc.control.nonlinear.motion import BEYOND, Course, can_drift, extend_rows, shift_end
-from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
-from koopmpc.control.plan.row_targets import RowTarget, RowTargets, TerminalCost
-from koopmpc.control.plan.tracking import StateTracking
+from koopmpc.control.nonlinear.equilibrium import Linearisation
+from koopmpc.control.nonlinear.stages import StageTargets
+from koopmpc.control.nonlinear.task import StagedTask
+from koopmpc.control.plan.row_targets import End, MovingEnd, RowTarget, RowTargets, TerminalCost
 
-AWAY = 2.0  # an equilibrium at limits may be so many sizes of a state from that of its row
-
-
-class End(NamedTuple):
-    """Where a plan ends: the equilibrium, the reference input there, and the terminal cost."""
-
-    equilibrium: Equilibrium
-    u: Float[np.ndarray, " nu"]
-    cost: TerminalCost
-
-
-class _Chord(NamedTuple):
-    """The Gauss–Newton step from s₀, and the slopes of the limited values [u; g] there on (x, u) by sizes."""
-
-    s: Float[np.ndarray, " n"]
-    response: Response
-    limited: Float[np.ndarray, "nl n"]
+BEYOND = 10  # horizons for which a reference goes on beyond its rows
+ORDERS = (2, 3, 4, 6)  # of linear recurrences with a constant: a ramp or a sine has 2, two sines have 4
+FITS = 1e-9  # share of a column's spread by which the recurrence may miss a row of the preview
+GROWS = 1e-3  # a recurrence may grow by this share a step
+DRIFTS = 1e-7  # a recurrence whose coefficients sum to 1 up to this drifts: it goes on for one horizon, then rests
+FOLLOWS = 1e-2  # a reference drifts on where equilibria follow it up to this share of its way
+RESTS = 3  # equal rows at the end of a preview that say that the reference rests
+STILL = 1e-12  # share of the largest row below which a column does not move
+TERMS = 1e-11  # directions of a column's past below this share of the largest have no coefficient
+ROUNDING = 1e-13  # directions of the inputs below this share of the largest have no gain
+BURSTS = 1e3  # the end stays where the loop behind it, or one without damping, would grow by this factor
+SEEN = 1e-5  # directions of x_N below this share of the largest cost nothing at the end
 
 
-class MovingEnd:
-    """Row target and e, where x⁺ = F(x, u) + e → End.
+class Course(NamedTuple):
+    """Rows of a reference behind its preview, none where it rests, and whether it drifts, as a ramp does."""
 
-    The error that one step leaves is of the square of the change of e, and gone once e rests. The step takes the
-    factors of an earlier one as long as that was close by: repeated, it converges the faster the closer that was, at a
-    fraction of the time.
+    rows: Float[np.ndarray, "T nr"]
+    drifts: bool = False
+
+
+def extend_rows(R: Float[np.ndarray, "N1 nr"], horizons: int = BEYOND) -> Course:
+    """Return the rows after R by the shortest linear recurrence r_k = Σ c_i r_{k−i} + c that all rows of R obey.
+
+    None, (0, nr), if the last rows rest, or if a column obeys no such recurrence, or one that grows. A column that
+    drifts goes on for one horizon and rests then.
     """
+    nothing, N = Course(np.zeros((0, R.shape[1]))), len(R) - 1
+    if not horizons or (R[-RESTS:] == R[-1]).all():
+        return nothing
+    columns = [_extend_column(column, horizons * N) for column in R.T]
+    known = [column for column in columns if column is not None]
+    if len(known) < len(columns):
+        return nothing
+    return Course(np.column_stack([rows for rows, _ in known]), any(drifts for _, drifts in known))
 
-    def __init__(self, targets: RowTargets) -> None:
-        self._targets = targets
-        self.forget()
 
-    def forget(self) -> None:
-        """Begin at the target of the row, for it is of another model or of another w."""
-        self._last: Equilibrium | None = None
-        self._chord: _Chord | None = None
+def _extend_column(r: Float[np.ndarray, " N1"], count: int) -> tuple[Float[np.ndarray, " T"], bool] | None:
+    spread = np.ptp(r)
+    if spread <= STILL * np.abs(r).max() or (r[-RESTS:] == r[-1]).all():
+        return np.full(count, r[-1]), False
+    z = (r - r[-1]) / spread
+    for order in ORDERS:
+        rows = len(z) - order
+        if rows < order + 2:
+            break
+        past = np.column_stack([*(z[i : rows + i] for i in range(order)), np.ones(rows)])
+        c: Float[np.ndarray, " n"] = np.asarray(np.linalg.lstsq(past, z[order:], rcond=TERMS)[0], dtype=np.float64)
+        if np.abs(past @ c - z[order:]).max() > FITS or _grows(c[:order]):
+            continue
+        step = np.eye(order + 1, k=1)
+        step[order - 1], step[order] = c, np.eye(order + 1)[order]
+        ahead = (step @ np.append(z[-order:], 1.0))[None]
+        while len(ahead) < count:  # rows 1 … 2ⁿ, from 1 … 2ⁿ⁻¹
+            ahead, step = np.vstack([ahead, ahead @ step.T]), step @ step
+        values, drifts = ahead[:count, order - 1], bool(abs(1 - c[:order].sum()) < DRIFTS)
+        if drifts:
+            values[len(r) - 1 :] = values[len(r) - 2]
+        return r[-1] + spread * values, drifts
+    return None
 
-    def at(self, target: RowTarget, e: Float[np.ndarray, " nx"]) -> End:
-        """Return the end of a row under e.
 
-        Where no Gauss–Newton steps lead to an equilibrium, or only e makes limits active and the equilibrium is far, as
-        under noise beyond what inputs hold, it is that of the row: ipopt went on to equilibria thousands of sizes away,
-        to which no loop should be led.
-        """
-        search, cost, own = self._targets.equilibria, self._targets.finish_at(target), target.equilibrium
-        begin = own if self._last is None else self._last
-        rest = self._follow(begin, target.row, e) or search.near(begin, target.row, e, CLOSE)
-        if rest is None or not target.is_found or self._is_far(rest, own):
-            self._last = own
-            return End(own, target.u, cost)
-        self._last = rest
-        u = rest.u * self._targets.holds
-        if not self._targets.ends_given:
-            of = search.linearise(rest.x, rest.u).of
-            cost = cost._replace(m=cost.M @ of + cost.L @ rest.x + cost.V @ u)
-        return End(rest, u, cost)
+def _grows(c: Float[np.ndarray, " n"]) -> bool:
+    """Return whether r_k = Σ c_i r_{k−n+i} has a root beyond 1 + GROWS, by the Schur–Cohn recursion."""
+    a = -c[::-1] / (1 + GROWS) ** np.arange(1, len(c) + 1)
+    while len(a):
+        last = a[-1]
+        if not abs(last) < 1:
+            return True
+        a = (a[:-1] - last * a[-2::-1]) / (1 - last**2) if len(a) > 1 else a[:0]
+    return False
 
-    def _follow(
-        self, begin: Equilibrium, row: Float[np.ndarray, " nr"], e: Float[np.ndarray, " nx"]
-    ) -> Equilibrium | None:
-        """Return the equilibrium by one step from `begin`; None where it is not close, or a limit is active."""
-        if begin.active.any():
-            return None
-        search, nx = self._targets.equilibria, len(begin.x)
-        s, at = np.concatenate([begin.x, begin.u]) / search.size, search.linearise(begin.x, begin.u)
-        close = CLOSE * (1 + np.abs(s).max())
-        if self._chord is None or np.abs(s - self._chord.s).max() > close:
-            nu = len(begin.u)
-            limited = np.zeros((nu + len(at.G), nx + nu))
-            limited[:nu, nx:], limited[nu:, :nx] = np.eye(nu), at.G
-            self._chord = _Chord(s, search.respond(at), limited * search.size)
-        _, (H, T), limited = self._chord
-        step = H @ ((at.F + e - begin.x) / search.size[:nx]) + T @ search.residuals(at, row, s)
-        reached = np.concatenate([begin.u, at.g]) + limited @ step
-        if not np.abs(step).max() <= close or (reached > search.high).any() or (reached < search.low).any():
-            return None
-        x, u = np.split((s + step) * search.size, [nx])
-        return Equilibrium(x, u, begin.active)
 
-    def _is_far(self, rest: Equilibrium, own: Equilibrium) -> bool:
-        """Return whether an equilibrium at limits is several sizes of the state from one that meets them."""
-        away = (np.abs(rest.x - own.x) / self._targets.equilibria.size[: len(own.x)]).max()
-        return bool(rest.active.any() and not own.active.any() and away > AWAY)
+def can_drift(
+    at: Linearisation,
+    followed: Float[np.ndarray, "n nr"],
+    Q_root: Float[np.ndarray, "nr nr"],
+    R: Float[np.ndarray, "N1 nr"],
+) -> bool:
+    """Return whether equilibria hold what the rows R move through: J ∂x/∂r d = d for d from the first to the last."""
+    d = R[-1] - R[0]
+    missed = at.J @ (followed[: len(at.A)] @ d) - d
+    return bool(np.linalg.norm(Q_root @ missed) <= FOLLOWS * np.linalg.norm(Q_root @ d))
+
+
+def shift_end(
+    end: TerminalCost,
+    u: Float[np.ndarray, " nu"],
+    at: Linearisation,
+    weights: tuple[Float[np.ndarray, "nr nr"], Float[np.ndarray, "nu nu"]],
+    size: Float[np.ndarray, " n"],
+    rows: Float[np.ndarray, "T1 nr"],
+    held: Float[np.ndarray, "nu nr"] | None,
+) -> TerminalCost:
+    """Return the cost of x_N where the rows r_N, r_{N+1}, … come, by the linear tracking problem behind x_N.
+
+    u is the input of the equilibrium x_r. With x̃ = x − x_r and δ_k = r_k − of(x_r) the cost-to-go is
+    x̃ᵀP x̃ − 2 p_Nᵀx̃ + …, so the target moves by P⁺p_N. Backward from p = 0 after the last row,
+    p_k = JᵀQ δ_k + (A − B K)ᵀ p_{k+1} − Kᵀ R v_k. v_k is the input that costs nothing, from u_r on: `held` δ_k where
+    inputs count from the one that holds a row, else −u_r. P is the end's cost. `weights` are Q and R, `size` that of x
+    and u.
+
+    References
+    ----------
+    Anderson & Moore, "Optimal Control: Linear Quadratic Methods", 1990, section 4.3 (servo and tracking problems).
+    """
+    nx = len(at.A)
+    sx, su = np.split(size, [nx])
+    A, B, J = at.A * sx / sx[:, None], at.B * su / sx[:, None], at.J * sx
+    Q, R = weights[0], weights[1] * np.outer(su, su)
+    S = (end.M @ at.J + end.L) * sx
+    PB = S.T @ (S @ B)
+    K: Float[np.ndarray, "nu nx"] = np.asarray(np.linalg.lstsq(R + B.T @ PB, PB.T @ A, rcond=ROUNDING)[0])
+    D = rows - at.of
+    wanted = np.tile(-u / su, (len(D), 1)) if held is None else D @ (held / su[:, None]).T
+    p, closed = D @ Q @ J - wanted @ (R @ K), A - B @ K
+    with np.errstate(over="ignore", invalid="ignore"):
+        while len(p) > 1:  # Σ closedᵀᵏ p_k: neighbours at once
+            if len(p) % 2:
+                p = np.vstack([p, np.zeros(nx)])
+            p, closed = p[::2] + p[1::2] @ closed, closed @ closed
+        stays = np.abs(closed.sum(axis=0)).max() < BURSTS and np.abs(p).max() < checks.HUGE
+    return end._replace(m=end.m + p[0] @ np.linalg.pinv(S, rcond=SEEN)) if stays else end
 
 
 class _Preview(NamedTuple):
@@ -112,29 +152,18 @@ class _Preview(NamedTuple):
 
 
 class StageAim:
-    """Reference, e and the weight of the last input → StageTargets, the same object until one of them moves.
-
-    Parameters
-    ----------
-    targets, outputs, problem
-        The targets of rows, what the cost tracks, and the stages.
-    latency
-        Steps until the first input of a plan acts.
-    disturbed
-        Whether disturbances, measured or estimated, move the target.
-    """
+    """Reference, e and the weight of the last input → StageTargets, the same object until one of them moves."""
 
     end: End  # of the last step
 
-    def __init__(
-        self, targets: RowTargets, outputs: StateTracking, problem: StagedProblem, latency: int, *, disturbed: bool
-    ) -> None:
-        self.targets, self._outputs, self._problem, self._latency = targets, outputs, problem, latency
-        self._disturbed, self._moving = disturbed, MovingEnd(targets)
+    def __init__(self, task: StagedTask) -> None:
+        outputs = self._outputs = task.outputs
+        self.targets = RowTargets(task.map, outputs, 10 * task.N)
+        self._problem, self._latency = task.problem, task.latency
+        self._disturbed, self._moving = task.disturbed, MovingEnd(self.targets)
         self._goes_on = outputs.cost.moves_on and outputs.given is None
         tables = [table for table in (outputs.given, outputs.shift) if table is not None]
         self._last_row = max((len(table) for table in tables), default=1) - 1  # of inputs that are given in rows
-        self.restart()
 
     def restart(self) -> None:
         """Begin at the first row of inputs that are given in rows."""

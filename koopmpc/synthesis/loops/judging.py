@@ -9,8 +9,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc.base.errors import KoopmpcError
+from koopmpc.control.kinds.bilinear_mpc import BilinearMPC
 from koopmpc.control.move import Controller
-from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.episodes import Episodes
 from koopmpc.loop.metrics import total_cost, violation_shares
 from koopmpc.loop.run import Run

@@ -12,7 +12,7 @@ from koopmpc.base.values import Value
 from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.nonlinear.equilibrium import Equilibria, Equilibrium
-from koopmpc.control.nonlinear.learned_map import LearnedMap, learned_map
+from koopmpc.control.nonlinear.stages import LearnedMap, learned_map
 from koopmpc.control.plan.tracking import state_tracking
 from koopmpc.data.episodes import Episodes
 from koopmpc.plants.step_map import StepMap
@@ -99,9 +99,7 @@ class Surrogate(Value):
     def holding(self, cost: Cost, limits: Limits, gain: float = 1.0) -> "Holding":
         """Return the search for the equilibrium of this plant nearest to a row inside the limits, from the last one."""
         given = self._map(gain)
-        equilibria = Equilibria(
-            given, cost, state_tracking(self.model.states, self.model.inputs, cost, limits, given.nx)
-        )
+        equilibria = Equilibria(given, state_tracking(self.model.states, self.model.inputs, cost, limits, given.nx))
         push, known, last = given.E @ self.w, dict[bytes, Equilibrium](), list[Equilibrium]()
 
         def find(row: Float[np.ndarray, " nr"]) -> Equilibrium:

@@ -12,8 +12,8 @@ from koopmpc.base.values import Value
 from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.kinds import kind_for
+from koopmpc.control.kinds.bilinear_mpc import BilinearMPC
 from koopmpc.control.kinds.koopman_mpc import KoopmanMPC
-from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source
 from koopmpc.estimate.disturbance import LiftedDisturbance

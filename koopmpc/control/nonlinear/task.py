@@ -1,21 +1,86 @@
-"""Limits in time for the stages of BilinearMPC and NonlinearMPC: rows of u, x and y in place of the constructor's."""
+"""What is asked of BilinearMPC and NonlinearMPC, checked; and its limits in time: rows of u, x and y for each step."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from koopmpc.base import checks
 from koopmpc.base.errors import DataError
-from koopmpc.base.values import Value
+from koopmpc.base.values import Interval, Value
 from koopmpc.control.ask.bounds import refuse_crossed_rows
-from koopmpc.control.ask.limits import Interval, Limits
+from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.limits import Limits
 from koopmpc.control.ask.preview import check_bounds_alone, require_preview
-from koopmpc.control.nonlinear.problem import StagedProblem
-from koopmpc.control.plan.tracking import StateTracking
+from koopmpc.control.nonlinear.stages import LearnedMap, ModelOrMap, StagedProblem, learned_map, staged_problem
+from koopmpc.control.plan.task import MoveBlocks, Moves, find_move_blocks
+from koopmpc.control.plan.tracking import StateTracking, data_ranges, state_tracking
+from koopmpc.control.solvers.priorities import weigh_priorities
+from koopmpc.estimate.observer import Estimator
+from koopmpc.plants.step_map import StepMap
 
 _FAR = 1e3  # a row without a limit is this many sizes beyond the widest one, where it limits nothing
+
+
+@dataclass(frozen=True, kw_only=True)
+class StagedTask:
+    """What is asked of a controller that plans over the stages of a nonlinear model.
+
+    Attributes
+    ----------
+    map, outputs, problem
+        The model, what is tracked and limited, and the stages of the plan.
+    moves, latency
+        The blocks of held inputs, and steps until an input acts.
+    estimator, time_limit
+        The rule that finds d, and the wall-clock time of a step [s]; None without.
+    disturbed
+        Whether disturbances, measured or estimated, move the target.
+    """
+
+    map: LearnedMap
+    outputs: StateTracking
+    problem: StagedProblem
+    moves: MoveBlocks
+    latency: int
+    estimator: Estimator | None
+    time_limit: float | None
+    disturbed: bool
+
+    @property
+    def N(self) -> int:
+        """Steps of the plan."""
+        return len(self.problem.free)
+
+
+def read_staged_task(
+    model: ModelOrMap,
+    cost: Cost,
+    limits: Limits | None,
+    horizon: int,
+    moves: Moves,
+    latency: int,
+    estimator: Estimator | None,
+    time_limit: float | None,
+    who: str,
+) -> StagedTask:
+    """Return the task of a controller, checked; `who` is told where weights stand for priorities."""
+    given, ranges = learned_map(model), {} if isinstance(model, StepMap) else data_ranges(model)
+    o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges, in_time=True)
+    if o.limits.priority is not None:
+        o = replace(o, softness=weigh_priorities(o.softness, o.limits, model.states, who))
+    blocks = find_move_blocks(moves, horizon, model.inputs)
+    return StagedTask(
+        map=given,
+        outputs=o,
+        problem=staged_problem(given, o, blocks),
+        moves=blocks,
+        latency=checks.count(latency, "latency", 0),
+        estimator=estimator,
+        time_limit=None if time_limit is None else checks.positive(time_limit, "time_limit", "s"),
+        disturbed=estimator is not None or given.nw > 0,
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -52,12 +117,7 @@ class StageLimits(NamedTuple):
 
 
 class MovingLimits:
-    """Step and limits of a call → StageLimits: the same object while none of them moves.
-
-    Parameters
-    ----------
-    latency
-        Steps until the first input of a plan acts.
+    """Step → StageLimits: the same object while none of them moves.
 
     Raises
     ------
@@ -65,21 +125,18 @@ class MovingLimits:
         See `check_rows`.
     """
 
-    def __init__(
-        self, outputs: StateTracking, problem: StagedProblem, states: Sequence[str], inputs: Sequence[str], latency: int
-    ) -> None:
-        self._own, self._outputs, self._problem, self._latency = outputs.limits, outputs, problem, latency
-        self._names, self._called_with = (tuple(states), tuple(inputs)), None
-        self._fixed, self._timed = StageLimits(outputs.inputs, problem.stage_limits), self._own.in_time
+    def __init__(self, task: StagedTask) -> None:
+        self._own, self._task, self._called_with = task.outputs.limits, task, None
+        self._fixed, self._timed = StageLimits(task.outputs.inputs, task.problem.stage_limits), self._own.in_time
         if self._timed:
-            check_rows(self._own, outputs, problem, inputs, None)
+            check_rows(self._own, task, None)
 
-    def at(self, step: int, limits: Limits | None) -> StageLimits:
-        """Return the limits of a step: those of the call, or the controller's own."""
-        if limits is None and not self._timed:
-            return self._fixed
-        if limits is None:
-            return self._find(self._own, step)
+    def at(self, step: int) -> StageLimits:
+        """Return the controller's own limits in a step."""
+        return self._find(self._own, step) if self._timed else self._fixed
+
+    def at_call(self, limits: Limits) -> StageLimits:
+        """Return the limits of a call."""
         if limits is not self._called_with:
             self._at_call = self.read(limits)
             self.check(self._at_call)
@@ -88,28 +145,20 @@ class MovingLimits:
 
     def read(self, limits: Limits) -> Limits:
         """Return the limits of a call with arrays in place of names; DataError where more than bounds differ."""
-        return check_bounds_alone(limits, self._own, *self._names)
+        model = self._task.map.model
+        return check_bounds_alone(limits, self._own, model.states, model.inputs)
 
     def check(self, limits: Limits) -> None:
         """Raise where limits of a call cross, have no row in the stages, or too few rows."""
-        preview = len(self._problem.free) + self._latency
-        check_rows(limits, self._outputs, self._problem, self._names[1], preview)
+        check_rows(limits, self._task, self._task.N + self._task.latency)
 
     def _find(self, limits: Limits, step: int) -> StageLimits:
-        return find_stage_limits(limits, self._outputs, self._problem, step + self._latency, self._fixed.stages)
+        task = self._task
+        return find_stage_limits(limits, task.outputs, task.problem, step + task.latency, self._fixed.stages)
 
 
-def check_rows(
-    limits: Limits, outputs: StateTracking, problem: StagedProblem, inputs: Sequence[str], preview: int | None
-) -> None:
-    """Raise where limits in time ask for what the stages do not have.
-
-    Parameters
-    ----------
-    inputs
-        Names of the model.
-    preview
-        Steps that a call reads; None for the rows of a run.
+def check_rows(limits: Limits, task: StagedTask, preview: int | None) -> None:
+    """Raise where limits in time ask for what the stages do not have; a call reads `preview` steps.
 
     Raises
     ------
@@ -119,6 +168,7 @@ def check_rows(
     ShapeError
         A bound has too few rows.
     """
+    outputs, problem, inputs = task.outputs, task.problem, task.map.model.inputs
     counts = limits.count_rows()
     rates = next((end for end in counts if end.startswith("du")), None)
     if rates is not None:

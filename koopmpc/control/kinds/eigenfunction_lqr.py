@@ -16,9 +16,9 @@ from koopmpc.control.ask.checks import refuse_levels
 from koopmpc.control.ask.cost import Cost, check_cost_and_limits, refuse_stage, refuse_steps
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.kinds import ControllerKind, register_controller
-from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone
 from koopmpc.control.program import SavedController
+from koopmpc.control.step.feedback import FeedbackLaw
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Eigenfunction
 from koopmpc.plants.graph import Graph

@@ -11,12 +11,14 @@ from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
-from koopmpc.control.nonlinear.learned_map import ModelOrMap
 from koopmpc.control.nonlinear.shooting import OPTIONS, NLPSolver
 from koopmpc.control.nonlinear.shooting_solver import ShootingSolver
 from koopmpc.control.nonlinear.staged_mpc import StagedMPC
+from koopmpc.control.nonlinear.stages import ModelOrMap
+from koopmpc.control.nonlinear.task import StagedTask
 from koopmpc.control.plan.task import Moves
 from koopmpc.control.program import Program, no_export
+from koopmpc.control.step.staged import StagedStep
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator
@@ -100,16 +102,17 @@ class NonlinearMPC(StagedMPC):
         time_limit: float | None = None,
         monitor: StepMonitor | Episodes | None = None,
     ) -> None:
-        super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
         if solver not in OPTIONS:
             raise DataError(f'solver is {solver!r}; pass "ipopt", "fatrop" or "sqpmethod"')
-        starts = checks.count(starts, "starts")
-        fixes = {} if self._levels is None else {"inputs_check": False}  # it warns of nodes that fix all inputs
-        options = solver, {**fixes, **(settings or {})}, time_limit is not None
-        self._own = {"solver": solver, "starts": starts, "settings": dict(settings or {})}
-        self._solver = ShootingSolver(
-            self._problem, self._map, self._outputs.inputs, options, starts, self._levels, self._blocks
-        )
+        own = {"solver": solver, "starts": checks.count(starts, "starts"), "settings": dict(settings or {})}
+        self._own: dict[str, Any] = own
+        super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
+
+    def _make_solver(self, task: StagedTask, step: StagedStep) -> ShootingSolver:
+        own = self._own
+        fixes = {} if step.levels is None else {"inputs_check": False}  # it warns of nodes that fix all inputs
+        options = own["solver"], {**fixes, **own["settings"]}, task.time_limit is not None
+        return ShootingSolver(task, options, own["starts"], step.levels)
 
     def _made_of(self) -> tuple[str, ModelOrMap, dict[str, Any]]:
         return "NonlinearMPC", self.model, self._own

@@ -5,8 +5,9 @@ and PID controller tuning", J. Process Control 13, 2003 (SIMC).
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from time import perf_counter
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,15 +15,15 @@ from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
-from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.errors import DataError, ShapeError, refuse_moved
 from koopmpc.control.ask.checks import refuse_levels
 from koopmpc.control.ask.cost import Cost, check_cost_and_limits
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
-from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone
 from koopmpc.control.plan.tracking import lifted_tracking
 from koopmpc.control.program import SavedController
+from koopmpc.control.step.feedback import FeedbackLaw
 from koopmpc.models.predictors import LinearPredictor
 
 _Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
@@ -40,6 +41,26 @@ class StepResponse(NamedTuple):
     delay: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class PIDOptions:
+    """What few PIDs change.
+
+    Attributes
+    ----------
+    b, c
+        Weights of the set point in the proportional part and in the derivative.
+    filter_time
+        (nu,) T_f [s]; by default a tenth of kd / kp.
+    references
+        For each input, the index of its set point in r; by default 0, 1, …
+    """
+
+    b: float = 1.0
+    c: float = 0.0
+    filter_time: ArrayLike | None = None
+    references: Sequence[int] | None = None
+
+
 class PID(FeedbackLaw):
     """u = bias + kp (b r − y) + I + D for each input, of one measured output each, clipped to the limits.
 
@@ -54,16 +75,14 @@ class PID(FeedbackLaw):
         (nu,) or scalars: gains of the error, of its integral [1/s], and of its derivative [s]. Each input has one loop.
     dt
         Sampling time [s].
-    outputs, references
-        For each input, the index of its measurement in y and of its set point in r; by default 0, 1, …
+    outputs
+        For each input, the index of its measurement in y; by default 0, 1, …
     limits
         Limits of the inputs and of their changes; others are not seen.
-    filter_time
-        (nu,) T_f [s]; by default a tenth of kd / kp.
-    b, c
-        Weights of the set point in the proportional part and in the derivative.
     bias
         (nu,) u where nothing is wrong.
+    options
+        Weights of the set point, the filter's time, and which set point is whose.
 
     Raises
     ------
@@ -86,15 +105,16 @@ class PID(FeedbackLaw):
         *,
         dt: float,
         outputs: Sequence[int] | None = None,
-        references: Sequence[int] | None = None,
         limits: Limits | None = None,
-        filter_time: ArrayLike | None = None,
-        b: float = 1.0,
-        c: float = 0.0,
         bias: ArrayLike = 0.0,
+        options: PIDOptions | None = None,
+        **moved: object,
     ) -> None:
+        refuse_moved(moved, PIDOptions, "km.control.PIDOptions")
+        known = PIDOptions() if options is None else options
+        checks.kind(known, "options", PIDOptions, "pass km.control.PIDOptions(b=…)")
         gains = [np.atleast_1d(checks.array(value, name)) for value, name in ((kp, "kp"), (ki, "ki"), (kd, "kd"))]
-        for given, name in ((outputs, "outputs"), (references, "references")):
+        for given, name in ((outputs, "outputs"), (known.references, "references")):
             if given is not None:
                 checks.kind(given, name, (tuple, list, range, np.ndarray), "pass one index a loop")
         if limits is not None:
@@ -110,7 +130,7 @@ class PID(FeedbackLaw):
                 values = f"kp = {self.kp[i]:g}, ki = {self.ki[i]:g}, kd = {self.kd[i]:g}"
                 raise DataError(f"loop {i} has {values}; the gains of one loop have one sign")
         self.outputs = _indices(outputs, "outputs", nu)
-        self.references = _indices(references, "references", nu)
+        self.references = _indices(known.references, "references", nu)
         self.limits = limits or Limits()
         widest = self.limits.base
         super().__init__(checks.positive(dt, "dt", "s"), 0, widest.inputs(nu), widest.rates(nu))
@@ -118,12 +138,12 @@ class PID(FeedbackLaw):
         with np.errstate(divide="ignore", invalid="ignore"):
             tenth = np.where(self.kp != 0, 0.1 * self.kd / np.where(self.kp != 0, self.kp, 1.0), self.dt)
             share = self.dt * self.ki / np.where(self.kp != 0, self.kp, 1.0)
-        self._filter = tenth if filter_time is None else checks.vector(filter_time, "filter_time", nu)
+        self._filter = tenth if known.filter_time is None else checks.vector(known.filter_time, "filter_time", nu)
         if (self._filter < 0).any():
             raise DataError(f"filter_time is {self._filter}; pass times of 0 s or more")
         # P or PD alone has no integral that could wind up; an integral alone follows at once
         self._back = np.where(self.ki == 0, 0.0, np.where(self.kp != 0, np.minimum(share, 1.0), 1.0))
-        self.b, self.c = float(checks.array(b, "b", ())), float(checks.array(c, "c", ()))
+        self.b, self.c = (float(checks.array(value, name, ())) for value, name in ((known.b, "b"), (known.c, "c")))
         self.bias = checks.vector(bias, "bias", nu)
         self._forget()
 
@@ -181,9 +201,9 @@ class PID(FeedbackLaw):
             kp / np.minimum(slow, 8 * delay),
             dt=model.dt,
             outputs=[measured[i] for i in place],
-            references=[int(weighed[i]) for i in place],
             limits=known,
             bias=bias,
+            options=PIDOptions(references=[int(weighed[i]) for i in place]),
         )
 
     def as_data(self) -> SavedController:
@@ -196,8 +216,9 @@ class PID(FeedbackLaw):
     @classmethod
     def from_data(cls: type[_Restored], saved: SavedController) -> _Restored:
         """Return the controller that is made of these data."""
-        build: Any = cls
-        return build(limits=saved.limits, **saved.options)
+        build, given, names = cast("Any", cls), dict(saved.options), [field.name for field in fields(PIDOptions)]
+        shape = PIDOptions(**{name: given.pop(name) for name in names})
+        return build(limits=saved.limits, options=shape, **given)
 
     def _forget(self) -> None:
         self._integral, self._derivative = np.zeros(self.nu), np.zeros(self.nu)

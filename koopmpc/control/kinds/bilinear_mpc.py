@@ -14,16 +14,17 @@ from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.nonlinear.iteration import RealTimeIteration
-from koopmpc.control.nonlinear.learned_map import ModelOrMap
-from koopmpc.control.nonlinear.motion import BEYOND
 from koopmpc.control.nonlinear.real_time_solver import RealTimeSolver
-from koopmpc.control.nonlinear.rows import describe_stage_bounds
 from koopmpc.control.nonlinear.staged_mpc import StagedMPC
 from koopmpc.control.nonlinear.staged_program import StagedProgram, find_targets, first_gain, trace_functions
+from koopmpc.control.nonlinear.stages import ModelOrMap
 from koopmpc.control.nonlinear.stagewise import list_sides, weights
+from koopmpc.control.nonlinear.task import StagedTask, describe_stage_bounds
 from koopmpc.control.plan.task import Moves
-from koopmpc.control.program import no_export, reference_table, refuse_time_limit, trace_lifting
+from koopmpc.control.program import no_export, reference_table, trace_lifting
 from koopmpc.control.solvers.daqp import daqp_settings
+from koopmpc.control.step.aim import BEYOND
+from koopmpc.control.step.staged import StagedStep
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.disturbance import LiftedDisturbance
@@ -122,13 +123,12 @@ class BilinearMPC(StagedMPC):
             raise DataError(
                 f"moves is {dict(moves)}; a BilinearMPC holds all inputs in the same blocks: pass a number or lengths"
             )
-        super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
         self._sqp_iterations = checks.count(sqp_iterations, "sqp_iterations")
-        self._iteration = RealTimeIteration(self._problem, compiles_model=self._compiles_model)
-        self._solver = RealTimeSolver(
-            self._iteration, self._map, self._outputs.inputs, self._sqp_iterations, self._levels
-        )
-        self._X, self._U = self._iteration.X[:, : self._map.nx], np.zeros((self._N, self.nu))
+        super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
+
+    def _make_solver(self, task: StagedTask, step: StagedStep) -> RealTimeSolver:
+        self._iteration = RealTimeIteration(task.problem, compiles_model=self._compiles_model)
+        return RealTimeSolver(self._iteration, task, self._sqp_iterations, step.levels)
 
     def _made_of(self) -> tuple[str, ModelOrMap, dict[str, Any]]:
         return "BilinearMPC", self.model, {"sqp_iterations": self._sqp_iterations}
@@ -146,11 +146,11 @@ class BilinearMPC(StagedMPC):
 
         Where measured disturbances multiply the state, it is that of w = 0.
         """
-        return find_targets(self._aim.targets, self._map.nx, reference)
+        return find_targets(self._step.aim.targets, self._task.map.nx, reference)
 
     def _refuse_export(self) -> None:
         """Raise a DataError where the controller has what its C does not know."""
-        problem, outputs = self._problem, self._outputs
+        problem, outputs = self._task.problem, self._task.outputs
         priced = outputs.shift is not None or outputs.pull is not None
         levels = "its inputs are on levels, and the search over them has no C code"
         for obstacle, why, instead in (
@@ -161,7 +161,7 @@ class BilinearMPC(StagedMPC):
                 "its cost has a stage of its own, which its C does not know",
                 "one without a stage",
             ),
-            (self._levels is not None, levels, "one without levels"),
+            (self._step.levels is not None, levels, "one without levels"),
             (problem.ends > 0, "its C has no terminal set", "a LinearMPC or a KoopmanMPC with a terminal polytope"),
         ):
             if obstacle:
@@ -169,11 +169,12 @@ class BilinearMPC(StagedMPC):
 
     def build_program(self, reference: ArrayLike | None) -> StagedProgram:
         """Return the data of a step."""
-        problem, outputs, model = self._problem, self._outputs, self._map
+        task = self._task
+        problem, outputs, model = task.problem, task.outputs, task.map
         self._refuse_export()
         refuse_time_limit(self._time_limit, "sqp_iterations=1")
         estimator = estimator_program(self._initial.observer, self._estimator)
-        rows, terminal, cost = reference_table(reference, len(outputs.Q)), self._aim.targets, self.cost
+        rows, terminal, cost = reference_table(reference, len(outputs.Q)), self._step.aim.targets, self.cost
         R, held = weights(problem), int((~problem.free).argmax()) * (not problem.free.all())
         return StagedProgram(
             controller=type(self).__name__,
@@ -184,12 +185,12 @@ class BilinearMPC(StagedMPC):
             given=outputs.given,
             reference=rows,
             sizes=terminal.equilibria.size[: model.nx],
-            gain=first_gain(terminal, outputs, self._N, rows[0]) if len(rows) else np.zeros((self.nu, model.nx)),
+            gain=first_gain(terminal, outputs, task.N, rows[0]) if len(rows) else np.zeros((self.nu, model.nx)),
             settings=daqp_settings(),
             functions=trace_functions(problem, outputs, model),
-            N=self._N,
+            N=task.N,
             affine=problem.affine,
-            latency=self._latency,
+            latency=task.latency,
             iterations=self._sqp_iterations,
             nx=model.nx,
             ny=model.ny,
@@ -216,9 +217,9 @@ class BilinearMPC(StagedMPC):
             input_sizes=problem.input_sizes,
             holds=terminal.holds,
             end="given" if cost.Q_N is not None else "stage" if cost.tail == 0 else "tail",
-            beyond=BEYOND * self._N * (cost.moves_on and outputs.given is None),
+            beyond=BEYOND * task.N * (cost.moves_on and outputs.given is None),
             table=self.find_targets(rows) if len(rows) else np.zeros((0, 1)),
-            disturbed=self._disturbed,
+            disturbed=task.disturbed,
             rest=terminal.equilibria.program(),
             tail=terminal.program(),
             estimator=estimator,
