@@ -78,8 +78,8 @@ MOST = {  # files, returns
     "bilinear_edmd": (10, 7),
     "KoopmanMPC": (22, 31),
     "step": (7, 8),
-    "BilinearMPC": (22, 29),
-    "bilinear_step": (17, 26),
+    "BilinearMPC": (22, 33),
+    "bilinear_step": (14, 25),
     "simulate": (13, 24),
     # with the files of the ground and of liftings, which those above leave out
     "simulate_all": (15, 30),

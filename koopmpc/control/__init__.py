@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from koopmpc.control.move import Fallback as Fallback
     from koopmpc.control.move import Fallible as Fallible
     from koopmpc.control.move import Plan as Plan
+    from koopmpc.control.nonlinear.shooting import NLP as NLP
     from koopmpc.control.nonlinear.staged_program import StagedProgram as StagedProgram
     from koopmpc.control.plan.condensed_program import CondensedProgram as CondensedProgram
     from koopmpc.control.program import Program as Program

@@ -76,7 +76,7 @@ def test_converged_passes_are_nonlinear_mpc_on_the_same_map(cost: km.Cost, limit
     model = pendulum()
     reference = [0, 1, 0] if cost is CIRCLE else [0, 0]
     ours = km.BilinearMPC(model, cost, limits, 15, sqp_iterations=60)
-    theirs = km.NonlinearMPC(model.step_map(), cost, limits, 15, settings={"ipopt.tol": 1e-10})
+    theirs = km.NonlinearMPC(model.step_map(), cost, limits, 15, solver=km.control.NLP(settings={"ipopt.tol": 1e-10}))
     x = np.array([0.7, -0.3])
     for _ in range(5):
         a, b = ours(x, reference), theirs(x, reference)

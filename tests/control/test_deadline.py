@@ -57,8 +57,8 @@ def test_a_deadline_must_be_above_zero(limit):
 @pytest.mark.parametrize("solver", ["ipopt", "sqpmethod"])
 def test_a_nonlinear_step_ends_after_the_iteration_in_which_its_time_is_over_and_takes_no_other_start(solver):
     asked = unstable_model().step_map(), km.Cost(Q=[1, 1], R=1e-3), km.Limits(-1, 1), 25
-    free = km.NonlinearMPC(*asked, solver=solver, starts=3)([0.2, 0.1], [0, 0])
-    late = km.NonlinearMPC(*asked, solver=solver, starts=3, time_limit=1e-9)([0.2, 0.1], [0, 0])
+    free = km.NonlinearMPC(*asked, solver=km.control.NLP(solver, starts=3))([0.2, 0.1], [0, 0])
+    late = km.NonlinearMPC(*asked, solver=km.control.NLP(solver, starts=3), time_limit=1e-9)([0.2, 0.1], [0, 0])
     assert late.status is km.Status.TIME_LIMIT
     assert late.iterations <= 1 < free.iterations
     assert np.abs(late.u).max() <= 1

@@ -123,7 +123,7 @@ def test_nonlinear_mpc_takes_the_predictor_and_converged_passes_agree(
     bilinear: km.BilinearPredictor, limits: km.Limits
 ) -> None:
     cost = km.Cost(Q=[2.0], R=0.1, Q_N=[[3.0]])
-    oracle = km.NonlinearMPC(bilinear, cost, limits, 10, settings={"ipopt.tol": 1e-10})
+    oracle = km.NonlinearMPC(bilinear, cost, limits, 10, solver=km.control.NLP(settings={"ipopt.tol": 1e-10}))
     ours = km.BilinearMPC(bilinear, cost, limits, 10, sqp_iterations=60)
     on_points = km.NonlinearMPC(
         bilinear.step_map(), km.Cost(Q=[2.0], R=0.1, of=km.State("y")), km.Limits(limits.u_min, limits.u_max), 10

@@ -82,7 +82,7 @@ def test_on_a_linear_plant_it_equals_koopman_mpc(name):
     if cost.Q_N is None and name != "of":
         cost = replace(cost, Q_N=[[3, 1], [1, 2]])  # the default end of a nonlinear controller is another
     one = km.KoopmanMPC(linear(A, B, constant=DRIFT), cost, limits, N, settings=PRECISE)
-    other = km.NonlinearMPC(step_map(A, B, constant=DRIFT), cost, limits, N, settings=SHARP)
+    other = km.NonlinearMPC(step_map(A, B, constant=DRIFT), cost, limits, N, solver=km.control.NLP(settings=SHARP))
     t = np.arange(40)
     signal = np.column_stack([0.6 * np.sign(np.sin(0.4 * t)), 0.2 * np.cos(0.3 * t)])[:, :nr]
     x, seen = np.array([0.6, 0.5]), set()
@@ -154,7 +154,9 @@ def test_an_estimate_from_which_no_next_state_is_found_ends_no_loop():
 
 
 def test_every_end_has_a_status_and_a_safe_input():
-    short = km.NonlinearMPC(step_map(A, B), km.Cost(1, 0.1), km.Limits(-0.5, 0.5), 6, settings={"ipopt.max_iter": 1})
+    short = km.NonlinearMPC(
+        step_map(A, B), km.Cost(1, 0.1), km.Limits(-0.5, 0.5), 6, solver=km.control.NLP(settings={"ipopt.max_iter": 1})
+    )
     move = short([2.0, 1.0], [0, 0])
     assert (move.status, move.fallback) == (km.Status.MAX_ITERATIONS, km.control.Fallback.HOLD)
     assert move.iterations == 2  # one from each of two starts
@@ -268,7 +270,7 @@ def test_several_starts_leave_a_local_optimum() -> None:
     """Hanging, at rest, no small input changes 1 − cos θ: one start stays, several do not."""
     plant, cost = pendulum(), km.Cost(Q=[1, 1, 0.01], R=0.01, of=UPRIGHT)
     hanging = [np.pi, 0.0]
-    one, several = (km.NonlinearMPC(plant, cost, km.Limits(-2, 2), 30, starts=n) for n in (1, 5))
+    one, several = (km.NonlinearMPC(plant, cost, km.Limits(-2, 2), 30, solver=km.control.NLP(starts=n)) for n in (1, 5))
     one(hanging, [0, 1, 0])
     several(hanging, [0, 1, 0])
     highest = [np.cos(mpc.plan().X[:, 0]).max() for mpc in (one, several)]

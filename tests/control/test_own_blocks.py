@@ -86,7 +86,9 @@ def test_nonlinear_mpc_and_the_linear_one_agree_under_all_limits():
     model, cost, x, r = draw(rng)
     limits = km.Limits(u_min=-0.5, u_max=0.7, du_max=0.4, x_max=1.5)
     linear = km.KoopmanMPC(model, cost, limits, 8, moves=OWN)
-    other = km.NonlinearMPC(model.step_map(), cost, limits, 8, moves=OWN, settings={"ipopt.tol": 1e-10})
+    other = km.NonlinearMPC(
+        model.step_map(), cost, limits, 8, moves=OWN, solver=km.control.NLP(settings={"ipopt.tol": 1e-10})
+    )
     for scale in (1.0, 0.4):
         for mpc in (linear, other):
             mpc.reset()

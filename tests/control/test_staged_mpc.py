@@ -50,7 +50,7 @@ def built(kind, model, cost, limits, horizon=N, **options):
     if kind == "bilinear":
         return km.BilinearMPC(model, cost, limits, horizon, sqp_iterations=3, **options)
     tight = {"ipopt.tol": 1e-10, "ipopt.bound_relax_factor": 0.0}
-    return km.NonlinearMPC(model, cost, limits, horizon, settings=tight, **options)
+    return km.NonlinearMPC(model, cost, limits, horizon, solver=km.control.NLP(settings=tight), **options)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -369,7 +369,7 @@ def test_several_starts_with_rates_find_the_better_side():
     plant = km.StepMap(ca.Function("F", [x, u], [ca.vertcat(x[0] + 0.1 * x[1], wall)]), 0.1)
     cost = km.Cost(Q=[1, 0.1], R=0.01, R_delta=0.02)
     limits = km.Limits(-3, 3, du_max=1.0)
-    one, several = (km.NonlinearMPC(plant, cost, limits, 15, starts=n) for n in (1, 5))
+    one, several = (km.NonlinearMPC(plant, cost, limits, 15, solver=km.control.NLP(starts=n)) for n in (1, 5))
     price = lambda plan: float((plan.X[1:] ** 2 @ [1, 0.1]).sum())  # noqa: E731
     for controller in (one, several):
         assert controller([2.0, 0.0], [0, 0]).status in GOOD
@@ -398,9 +398,9 @@ REFUSALS = {
     "BilinearMPC(plant, cost, horizon=0)": "DataError horizon is 0; it must be at least 1",
     "NonlinearMPC(plant, cost, horizon=0)": "DataError horizon is 0; it must be at least 1",
     "BilinearMPC(plant, cost, sqp_iterations=0)": "DataError sqp_iterations is 0; it must be at least 1",
-    "NonlinearMPC(plant, cost, starts=0)": "DataError starts is 0; it must be at least 1",
+    "NonlinearMPC(plant, cost, solver=km.control.NLP(starts=0))": "DataError starts is 0; it must be at least 1",
     'NonlinearMPC(plant, cost, solver="acados")': 'DataError solver is \'acados\'; pass "ipopt", "fatrop" or',
-    'NonlinearMPC(plant, cost, settings={"tol": 1})': "DataError ipopt was not built with settings {'tol': 1}",
+    'NonlinearMPC(plant, cost, solver=km.control.NLP(settings={"tol": 1}))': "DataError ipopt was not built with settings {'tol': 1}",
     "NonlinearMPC(plant, km.Cost([1, 1, 1], 1))": "ShapeError Q has shape (3,), expected (2, 2) or its diagonal",
     "NonlinearMPC(plant, km.Cost(1, 1, Q_N=np.eye(3)))": "ShapeError Q_N has shape (3, 3), expected (2, 2)",
     "BilinearMPC(plant, km.Cost(1, 1, Q_N=np.eye(2), of=km.Constant()))": "ShapeError Q_N weighs x_N − r_N, but the",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.nonlinear.stages import StagedProblem, learned_map, staged_problem
+from koopmpc.control.nonlinear.stages import StagedProblem, learned_map
 from koopmpc.control.nonlinear.stagewise import (
     RiccatiSweeps,
     interior_step,
@@ -15,6 +15,7 @@ from koopmpc.control.nonlinear.stagewise import (
     solve_unconstrained,
     weights,
 )
+from koopmpc.control.nonlinear.task import staged_problem
 from koopmpc.control.plan.task import find_move_blocks
 from koopmpc.control.plan.tracking import state_tracking
 

@@ -24,7 +24,7 @@ def controllers():
         km.KoopmanMPC(linear, COST, LIMITS, 9, estimator=estimator, latency=1, moves=4, solver="daqp", time_limit=5.0),
         km.KoopmanMPC(linear, COST, LIMITS, 9, settings={"max_iter": 50}),
         km.BilinearMPC(bilinear, COST, LIMITS, 9, sqp_iterations=2, estimator=estimator),
-        km.NonlinearMPC(bilinear, COST, LIMITS, 6, starts=2),
+        km.NonlinearMPC(bilinear, COST, LIMITS, 6, solver=km.control.NLP(starts=2)),
         km.LQR(linear, COST, LIMITS),
         km.supervise.Guarded(
             km.KoopmanMPC(linear, COST, LIMITS, 9, monitor=data()), km.LQR(linear, COST, LIMITS), patience=2

@@ -1,27 +1,27 @@
 """NonlinearMPC: multiple shooting and a nonlinear program a step; the oracle that others are measured against."""
 
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import fields, replace
+from typing import Any, TypeVar
 
 from numpy.typing import ArrayLike
 
-from koopmpc.base import checks
-from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
-from koopmpc.control.nonlinear.shooting import OPTIONS, NLPSolver
+from koopmpc.control.nonlinear.shooting import NLP, NLPSolver
 from koopmpc.control.nonlinear.shooting_solver import ShootingSolver
 from koopmpc.control.nonlinear.staged_mpc import StagedMPC
 from koopmpc.control.nonlinear.stages import ModelOrMap
 from koopmpc.control.nonlinear.task import StagedTask
 from koopmpc.control.plan.task import Moves
-from koopmpc.control.program import Program, no_export
+from koopmpc.control.program import Program, SavedController, no_export
 from koopmpc.control.step.staged import StagedStep
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator
+
+_Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
 
 
 class NonlinearMPC(StagedMPC):
@@ -46,15 +46,8 @@ class NonlinearMPC(StagedMPC):
     horizon
         N steps of the model's dt.
     solver
-        "ipopt"; "fatrop", an interior point method that uses the stages; "sqpmethod", sequential quadratic programs
-        solved by qrqp. fatrop does not end where a model is no number, so that it takes only models that provably
-        are numbers everywhere: no root, logarithm or division that may fail.
-    starts
-        Solve the first step, and one after a failure, from this many guesses, rest at x_0 and random inputs, and
-        keep the best: several where this controller is the oracle, so that a local optimum is not the reference.
-    settings
-        The solver's own settings by CasADi's names, for example ``{"ipopt.tol": 1e-10}``. It works on shares of the
-        sizes of inputs, states, limits and cost (see `Sizes`): its tolerances count so.
+        "ipopt", "fatrop" or "sqpmethod"; or one with its settings and several starts, ``km.control.NLP("fatrop",
+        starts=3)``.
     estimator, latency, moves
         As for BilinearMPC.
     time_limit
@@ -93,29 +86,33 @@ class NonlinearMPC(StagedMPC):
         limits: Limits | None = None,
         horizon: int = 20,
         *,
-        solver: NLPSolver = "ipopt",
-        starts: int = 1,
-        settings: Mapping[str, Any] | None = None,
+        solver: NLPSolver | NLP = "ipopt",
         estimator: Estimator | None = None,
         latency: int = 0,
         moves: Moves = None,
         time_limit: float | None = None,
         monitor: StepMonitor | Episodes | None = None,
+        **moved: object,
     ) -> None:
-        if solver not in OPTIONS:
-            raise DataError(f'solver is {solver!r}; pass "ipopt", "fatrop" or "sqpmethod"')
-        own = {"solver": solver, "starts": checks.count(starts, "starts"), "settings": dict(settings or {})}
-        self._own: dict[str, Any] = own
+        for word in moved:
+            known = f"stands with the solver now: pass solver=km.control.NLP({solver!r}, {word}=…)"
+            raise TypeError(f"{word}= {known if word in ('starts', 'settings') else 'is no argument'}")
+        self._nlp = solver if isinstance(solver, NLP) else NLP(solver)
         super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
 
     def _make_solver(self, task: StagedTask, step: StagedStep) -> ShootingSolver:
-        own = self._own
         fixes = {} if step.levels is None else {"inputs_check": False}  # it warns of nodes that fix all inputs
-        options = own["solver"], {**fixes, **own["settings"]}, task.time_limit is not None
-        return ShootingSolver(task, options, own["starts"], step.levels)
+        nlp = replace(self._nlp, settings={**fixes, **self._nlp.settings})
+        return ShootingSolver(task, nlp, step.levels)
 
     def _made_of(self) -> tuple[str, ModelOrMap, dict[str, Any]]:
-        return "NonlinearMPC", self.model, self._own
+        return "NonlinearMPC", self.model, {field.name: getattr(self._nlp, field.name) for field in fields(NLP)}
+
+    @classmethod
+    def from_data(cls: type[_Restored], saved: SavedController) -> _Restored:
+        """Return the controller that is made of these data."""
+        made: Any = super()
+        return made.from_data(replace(saved, options={"solver": NLP(**saved.options)}))
 
     def build_program(self, reference: ArrayLike | None) -> Program:
         """Raise the DataError that says why no C code can be generated."""
@@ -128,7 +125,7 @@ class NonlinearMPC(StagedMPC):
 
 def _build_oracle(parts: Any, limits: Limits) -> NonlinearMPC:
     """Plan with the model itself, from the best of twelve initial guesses: the oracle where the model is the plant."""
-    return NonlinearMPC(parts.step_map, parts.problem.cost, limits, parts.problem.horizon, starts=12)
+    return NonlinearMPC(parts.step_map, parts.problem.cost, limits, parts.problem.horizon, solver=NLP(starts=12))
 
 
 register_controller(

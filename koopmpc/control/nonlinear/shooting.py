@@ -1,6 +1,7 @@
 """Shooting: the nonlinear program of a horizon by multiple shooting, solved by one of CasADi's solvers."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, Literal, NamedTuple, cast
 
@@ -8,6 +9,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base import checks
 from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.control.ask.limits import SOFTENED, Interval
@@ -35,6 +37,41 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "qpsol_options": {"print_iter": False, "print_header": False, "error_on_fail": False},
     },
 }
+
+
+@dataclass(frozen=True)
+class NLP:
+    """A solver of nonlinear programs, as `NonlinearMPC` takes one.
+
+    Attributes
+    ----------
+    solver
+        "ipopt"; "fatrop", an interior point method that uses the stages; "sqpmethod", sequential quadratic programs
+        solved by qrqp. fatrop does not end where a model is no number, so that it takes only models that provably
+        are numbers everywhere: no root, logarithm or division that may fail.
+    starts
+        Solve the first step, and one after a failure, from this many guesses, rest at x_0 and random inputs, and
+        keep the best: several where the controller is the oracle, so that a local optimum is not the reference.
+    settings
+        The solver's own settings by CasADi's names, for example ``{"ipopt.tol": 1e-10}``. It works on shares of the
+        sizes of inputs, states, limits and cost (see `Sizes`): its tolerances count so.
+
+    Raises
+    ------
+    DataError
+        There is no such solver, or starts is below 1.
+    """
+
+    solver: NLPSolver = "ipopt"
+    starts: int = 1
+    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    def __post_init__(self) -> None:
+        if self.solver not in OPTIONS:
+            raise DataError(f'solver is {self.solver!r}; pass "ipopt", "fatrop" or "sqpmethod"')
+        checks.count(self.starts, "starts")
+
+
 # A step that failed says so by its status; nobody asks how the cost depends on the parameters.
 _QUIET = {"show_eval_warnings": False, "calc_lam_p": False}
 _STATUS = {
@@ -86,8 +123,10 @@ class Shooting:
     ----------
     problem, theta
         The stages, and the θ of their F.
-    solver, settings
-        CasADi's solver, and its settings by CasADi's names.
+    nlp
+        The solver and its settings.
+    timed
+        Whether the solver asks for the time after each iteration.
 
     Raises
     ------
@@ -104,11 +143,12 @@ class Shooting:
         self,
         problem: StagedProblem,
         theta: Float[np.ndarray, " nt"],
-        solver: NLPSolver,
-        settings: Mapping[str, Any],
-        timed: bool = False,
+        nlp: NLP,
+        *,
+        timed: bool,
     ) -> None:
-        p, (N, nu), ng = problem, problem.held_from.shape, len(problem.box.low)
+        solver, settings, p = nlp.solver, nlp.settings, problem
+        (N, nu), ng = problem.held_from.shape, len(problem.box.low)
         F, smooth = _fix_theta(p, theta), p.F.is_a("SXFunction")
         soft = np.flatnonzero(np.isfinite(p.softness.linear))
         ns, row = len(soft), p.softness.allowance / SOFTENED
@@ -135,20 +175,22 @@ class Shooting:
             f += ca.sum2(linear.T @ E + quadratic.T @ E**2)
         self._bound(p, ns)
         given = [x0, *targets[:2], e, *targets[2:], schedule, *diagonals]
-        nlp = {"x": ca.vec(W), "p": ca.veccat(*given), "f": f / p.scale, "g": _stack(gaps, path)}
+        program = {"x": ca.vec(W), "p": ca.veccat(*given), "f": f / p.scale, "g": _stack(gaps, path)}
         options: dict[str, Any] = {"expand": smooth, "error_on_fail": False, "print_time": False}
         self._start_is_number: ca.Function | None = None
         if solver == "fatrop":
             _demand_numbers(F, p.tracked, p.limited, *(() if p.stage is None else (p.stage,)))
-            self._start_is_number = _is_number(nlp)
+            self._start_is_number = _is_number(program)
             ends = {"nx": [0] + [p.nx] * N, "nu": [nu] + [ns + nu] * (N - 1) + [ns], "ng": [0] + [2 * ng] * N}
             options |= {"N": N, **ends}
-        self._clock = _Clock(W.numel(), nlp["g"].numel()) if timed and solver != "fatrop" else None
+        self._clock = _Clock(W.numel(), program["g"].numel()) if timed and solver != "fatrop" else None
         if self._clock is not None:
             options["iteration_callback"] = self._clock
         try:
             with raise_swallowed():
-                self._solver = ca.nlpsol("shooting", solver, nlp, {**_QUIET, **OPTIONS[solver], **options, **settings})
+                self._solver = ca.nlpsol(
+                    "shooting", solver, program, {**_QUIET, **OPTIONS[solver], **options, **settings}
+                )
         except (RuntimeError, NotImplementedError, TypeError) as error:
             reason = [line for line in str(error).splitlines() if line.strip()][-1].strip()
             raise DataError(

@@ -2,9 +2,9 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -14,7 +14,7 @@ from koopmpc.base.checks import HUGE
 from koopmpc.base.values import Interval
 from koopmpc.control.ask.levels import HeldLevels, LevelBox
 from koopmpc.control.move import Status
-from koopmpc.control.nonlinear.shooting import NLPSolution, NLPSolver, Shooting
+from koopmpc.control.nonlinear.shooting import NLP, NLPSolution, Shooting
 from koopmpc.control.nonlinear.shooting import Start as Begin
 from koopmpc.control.nonlinear.stages import LearnedMap, StagedProblem, StageTargets
 from koopmpc.control.nonlinear.task import StagedTask
@@ -36,29 +36,21 @@ class ShootingSolver(PlanSolver):
     ----------
     task
         What is asked.
-    options
-        The solver, its settings, and whether it looks at the time.
-    starts
-        Guesses of a first step.
+    nlp
+        The solver, its settings, and the guesses of a first step.
     levels
         The search over levels, where inputs have some.
     """
 
-    def __init__(
-        self,
-        task: StagedTask,
-        options: tuple[NLPSolver, Mapping[str, Any], bool],
-        starts: int,
-        levels: LevelSearch | None,
-    ) -> None:
-        self._problem, self._inputs, self._options, self._starts = task.problem, task.outputs.inputs, options, starts
+    def __init__(self, task: StagedTask, nlp: NLP, levels: LevelSearch | None) -> None:
+        self._problem, self._inputs, self._nlp, self._timed = task.problem, task.outputs.inputs, nlp, task.time_limit
         self._levels, self._blocks = levels, task.moves.lengths
         self.update(task.map)
 
     def update(self, model: LearnedMap) -> None:
         """Build the nonlinear program, and the search over sequences where all inputs are on levels in all steps."""
         self._map, p, levels = model, self._problem, self._levels
-        self._shooting = Shooting(p, model.theta, *self._options)
+        self._shooting = Shooting(p, model.theta, self._nlp, timed=self._timed is not None)
         self._rollouts: LevelRollouts | None = None
         self._stage_limits = p.stage_limits  # of this step
         if levels is not None and levels.index.shape == (len(self._blocks), model.nu) and not p.own:
@@ -167,7 +159,7 @@ class ShootingSolver(PlanSolver):
         guesses: list[Guess] = [(np.tile(x, (N + 1, 1)), np.tile(rest, (N, 1)))]
         rng = np.random.default_rng(0)
         low, high = np.maximum(self._inputs.low, rest - _WIDE), np.minimum(self._inputs.high, rest + _WIDE)
-        for _ in range(self._starts - 1):
+        for _ in range(self._nlp.starts - 1):
             U = np.repeat(rng.uniform(low, high, (-(-N // _HOLD), nu)), _HOLD, axis=0)[:N]
             guesses += self._roll_out(start, U)
         return self._list_begins(guesses, start)

@@ -3,19 +3,23 @@
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import casadi as ca
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from scipy.linalg import block_diag
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
+from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.values import Interval, Value
-from koopmpc.control.ask.bounds import refuse_crossed_rows
-from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.bounds import SOFTENED, Softness, preview_margin, refuse_crossed_rows
+from koopmpc.control.ask.cost import Cost, trace_stage
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.ask.preview import check_bounds_alone, require_preview
-from koopmpc.control.nonlinear.stages import LearnedMap, ModelOrMap, StagedProblem, learned_map, staged_problem
+from koopmpc.control.ask.terminal import HasTerminalSet, TerminalSet, read_terminal_set, terminal_function
+from koopmpc.control.nonlinear.stages import LearnedMap, ModelOrMap, StagedProblem, learned_map, point_sizes
 from koopmpc.control.plan.task import MoveBlocks, Moves, find_move_blocks
-from koopmpc.control.plan.tracking import StateTracking, data_ranges, state_tracking
+from koopmpc.control.plan.tracking import StateTracking, data_ranges, soften_end, state_tracking
 from koopmpc.control.solvers.priorities import weigh_priorities
 from koopmpc.estimate.observer import Estimator
 from koopmpc.plants.step_map import StepMap
@@ -37,6 +41,8 @@ class StagedTask:
         The rule that finds d, and the wall-clock time of a step [s]; None without.
     disturbed
         Whether disturbances, measured or estimated, move the target.
+    N
+        Steps of the plan.
     """
 
     map: LearnedMap
@@ -47,11 +53,7 @@ class StagedTask:
     estimator: Estimator | None
     time_limit: float | None
     disturbed: bool
-
-    @property
-    def N(self) -> int:
-        """Steps of the plan."""
-        return len(self.problem.free)
+    N: int
 
 
 def read_staged_task(
@@ -80,6 +82,129 @@ def read_staged_task(
         estimator=estimator,
         time_limit=None if time_limit is None else checks.positive(time_limit, "time_limit", "s"),
         disturbed=estimator is not None or given.nw > 0,
+        N=sum(blocks.lengths),
+    )
+
+
+@raise_swallowed()
+def staged_problem(model: LearnedMap, outputs: StateTracking, moves: MoveBlocks) -> StagedProblem:
+    """Return the problem of a horizon that is cut into blocks of held inputs."""
+    blocks = moves.lengths
+    o, N, F = outputs, sum(blocks), model.F
+    starts = np.cumsum([0, *blocks[:-1]])
+    free = np.zeros(N, dtype=np.bool_)
+    free[starts] = True
+    nx, nu = F.size1_in(0), F.size1_in(1)
+    plain = StagedProblem(
+        F=F,
+        tracked=o.tracked,
+        limited=o.limited,
+        Q=o.Q,
+        R=o.R,
+        inputs=o.inputs,
+        box=o.outputs,
+        softness=o.softness,
+        free=free,
+        held_from=np.repeat(starts[moves.origins()], blocks, axis=0),
+        own=moves.own,
+        with_rates=False,
+        soft_rates=np.zeros(0, dtype=np.intp),
+        nx=nx,
+        sizes=point_sizes(model, o),
+        input_sizes=o.sizes.inputs,
+        margin=preview_margin(o.margin, N),
+        scale=o.sizes.scale,
+        scheduled=model.scheduled,
+        stage=_stage_function(o.cost, model, nx, with_rates=False),
+        timed=o.cost.weighs_in_time,
+    )
+    wanted = o.limits.terminal
+    plain = plain._replace(affine=wanted is None and _is_affine(plain))
+    if not o.with_rates and len(blocks) == N and not moves.own:
+        return plain if wanted is None else _add_end(plain, wanted, model, o)
+    rates, soft, moves_alone = _split_rates(o, nu)
+    ns = nx + nu + len(soft)
+    sym, v, theta = ca.MX.sym("s", ns), ca.MX.sym("v", nu), ca.MX.sym("theta", F.size1_in(2))
+    u = sym[nx : nx + nu] + v
+    after = ca.Function("F", [sym, v, theta], [ca.vertcat(F(sym[:nx], u, theta), u, v[soft.tolist(), 0])])
+    s = ca.SX.sym("s", ns)
+    x, last = s[:nx], s[nx : nx + nu]
+    hard = np.full(nu, np.inf), np.zeros(nu), SOFTENED * plain.input_sizes
+    rated = plain._replace(
+        F=after.expand("F") if F.is_a("SXFunction") else after,
+        tracked=ca.Function("tracked", [s], [ca.vertcat(o.tracked(x), last)]),
+        limited=ca.Function("limited", [s], [ca.vertcat(last, s[nx + nu :], o.limited(x))]),
+        Q=block_diag(o.Q, o.R),
+        R=np.zeros((nu, nu)) if o.R_delta is None else o.R_delta,
+        inputs=moves_alone,
+        box=Interval(*(np.concatenate([o.inputs[i], rates[i][soft], o.outputs[i]]) for i in (0, 1))),
+        softness=Softness(*(np.concatenate([hard[i], o.rate_softness[i][soft], o.softness[i]]) for i in (0, 1, 2))),
+        with_rates=True,
+        soft_rates=soft,
+        nx=ns,
+        sizes=np.concatenate([plain.sizes, plain.input_sizes, plain.input_sizes[soft]]),
+        stage=_stage_function(o.cost, model, ns, with_rates=True),
+    )
+    return rated if wanted is None else _add_end(rated, wanted, model, o)
+
+
+def _split_rates(o: StateTracking, nu: int) -> tuple[Interval, Int[np.ndarray, " nsoft"], Interval]:
+    """Return the limits of changes, which of them are soft, and those of v, which are hard."""
+    rates = Interval(np.full(nu, -np.inf), np.full(nu, np.inf)) if o.rates is None else o.rates
+    given = np.isfinite(rates.low) | np.isfinite(rates.high)
+    soft = np.flatnonzero(given & np.isfinite(o.rate_softness.linear))
+    low, high = rates.low.copy(), rates.high.copy()
+    low[soft], high[soft] = -np.inf, np.inf
+    return rates, soft, Interval(low, high)
+
+
+def _is_affine(problem: StagedProblem) -> bool:
+    """Return whether the map and the outputs of a problem without rates are affine; those with rates are so alike."""
+    if problem.stage is not None or not problem.F.is_a("SXFunction"):
+        return False
+    both = ca.SX.sym("sv", problem.nx + problem.F.size1_in(1))
+    s, v, theta = both[: problem.nx], both[problem.nx :], ca.SX.sym("theta", problem.F.size1_in(2))
+    values = ca.vertcat(problem.F(s, v, theta), problem.tracked(s), problem.limited(s))
+    return not any(ca.which_depends(values, both, 2, True))
+
+
+def _stage_function(cost: Cost, model: LearnedMap, ns: int, *, with_rates: bool) -> ca.Function | None:
+    """Return (s, v) → ℓ(x, u), x the state of the plant; None where the cost has no stage of its own."""
+    if cost.stage is None:
+        return None
+    s, v = ca.SX.sym("s", ns), ca.SX.sym("v", model.nu)
+    u = s[model.nx : model.nx + model.nu] + v if with_rates else v
+    value = trace_stage(cost.stage, model.ny, model.nu).symbolic(s[: model.ny], u)
+    return ca.Function("stage", [s, v], [ca.densify(value)])
+
+
+def _add_end(
+    problem: StagedProblem, given: TerminalSet | HasTerminalSet, model: LearnedMap, o: StateTracking
+) -> StagedProblem:
+    """Return the problem with the values of a terminal set behind its limited outputs.
+
+    Raises
+    ------
+    DataError
+        The set holds the last input, which the stages do not.
+    """
+    wanted, nu, ny, nx = read_terminal_set(given), model.nu, model.ny, model.nx
+    if wanted.with_input and not problem.with_rates:
+        raise DataError(
+            "the terminal set holds the last input, and this controller has no limits of rates and no R_delta; make the"
+            " set with the cost and the limits of the controller"
+        )
+    s = ca.SX.sym("s", problem.nx)
+    u = s[nx : nx + nu] if problem.with_rates else ca.SX(nu, 1)
+    end = terminal_function(wanted, tuple(model.model.states), nu)(s[:ny], u)
+    count = int(end.size1())
+    box, soft = problem.box, soften_end(o.limits, count, problem.scale)
+    return problem._replace(
+        limited=ca.Function("limited", [s], [ca.vertcat(problem.limited(s), end)]),
+        box=Interval(np.append(box.low, np.full(count, -np.inf)), np.append(box.high, np.ones(count))),
+        softness=Softness(*(np.concatenate(pair) for pair in zip(problem.softness, soft, strict=True))),
+        margin=np.hstack([problem.margin, np.zeros((len(problem.margin), count))]),
+        ends=count,
     )
 
 
