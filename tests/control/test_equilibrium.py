@@ -146,7 +146,7 @@ def test_what_a_reference_says_of_states_without_weight_does_not_move_its_equili
     cost = km.Cost(Q=task.Q, R=task.R)
     tracking = state_tracking(model.states, model.inputs, cost, task.limits)
     silent, told = (
-        Equilibria(learned_map(model), cost, tracking).find(np.array([0.676, 340.0, wall])) for wall in (0.0, 302.8)
+        Equilibria(learned_map(model), tracking).find(np.array([0.676, 340.0, wall])) for wall in (0.0, 302.8)
     )
     np.testing.assert_allclose(silent.u, told.u, rtol=1e-6)
     assert abs(silent.x[1] - 340.0) < 0.2

@@ -21,7 +21,7 @@ from koopmpc.control.nonlinear.stages import ModelOrMap
 from koopmpc.control.nonlinear.stagewise import list_sides, weights
 from koopmpc.control.nonlinear.task import StagedTask, describe_stage_bounds
 from koopmpc.control.plan.task import Moves
-from koopmpc.control.program import no_export, reference_table, trace_lifting
+from koopmpc.control.program import no_export, reference_table, refuse_time_limit, trace_lifting
 from koopmpc.control.solvers.daqp import daqp_settings
 from koopmpc.control.step.aim import BEYOND
 from koopmpc.control.step.staged import StagedStep
