@@ -57,7 +57,9 @@ def find_best(x, N=4):
 @pytest.mark.parametrize("x", [[1.0, -0.5], [-2.0, 0.8], [0.1, 0.0]])
 def test_an_economic_stage_is_planned_to_its_optimum(kind, x):
     cost = km.Cost(Q=0, R=0.3, Q_N=END, u_target="zero", stage=economic)
-    options = {"sqp_iterations": 100} if kind is km.BilinearMPC else {"settings": {"ipopt.tol": 1e-10}}
+    options = (
+        {"sqp_iterations": 100} if kind is km.BilinearMPC else {"solver": km.control.NLP(settings={"ipopt.tol": 1e-10})}
+    )
     mpc = kind(MODEL, cost, km.Limits(u_min=-2, u_max=2), 4, **options)
     for _ in range(3):
         mpc(x, [0, 0])
