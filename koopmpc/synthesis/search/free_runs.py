@@ -22,7 +22,7 @@ from koopmpc.synthesis.search.leaderboard import LeaderboardRow, choose_model
 from koopmpc.validate.scoring import AnyPredictor, forecast_errors
 
 _GAIN = 0.98  # keep a refinement if it lowers the error on unseen rows to less than this share
-_PAYS = 0.9  # take a hidden state if it lowers the error on unseen rows to less than this share
+PAYS = 0.9  # take a hidden state if it lowers the error on unseen rows to less than this share
 _LOST = 1e3  # a free run counts as this many spreads at most
 _HALVES = 2  # errors of a quarter
 _ROWS_AT_ONCE = 500  # longer forecasts run in the compiled map, which takes as long to build as these rows take without
@@ -74,7 +74,7 @@ def judge_free_run(
         if behind or (beaten is not None and _must_halve(errors, beaten.errors)):
             left = _HALVES * FOLDS - len(errors) if rival is None else len(rival.errors) - len(errors)
             return FreeRun(np.array(errors + [_LOST] * left), False)
-    return FreeRun(np.array(errors), _is_calm(fit(seen), truth, first, relift) if calm is None else calm)
+    return FreeRun(np.array(errors), is_calm(fit(seen), truth, first, relift) if calm is None else calm)
 
 
 def leave_quarters(learned: Episodes, truth: Episodes, first: int) -> Iterator[tuple[list[tuple[int, int]], Episodes]]:
@@ -101,7 +101,7 @@ def _must_halve(errors: Sequence[float], than: Float[np.ndarray, " blocks"]) -> 
     """Return whether the other blocks must have less than half the errors `than`, for the mean to be low enough."""
     done = len(errors)
     gap = np.sum(np.log(np.maximum(errors, EXACT)) - np.log(np.maximum(than[:done], EXACT)))
-    return bool(len(than) * np.log(_PAYS) - gap < -(len(than) - done) * np.log(2))
+    return bool(len(than) * np.log(PAYS) - gap < -(len(than) - done) * np.log(2))
 
 
 def run_structure(structure: Structure, measured: Episodes, first: int, horizon: int) -> FreeRun:
@@ -184,7 +184,7 @@ def forecast_rows(
     )
 
 
-def _is_calm(model: AnyPredictor, pieces: Episodes, first: int, relift: bool) -> bool:
+def is_calm(model: AnyPredictor, pieces: Episodes, first: int, relift: bool) -> bool:
     centre = np.concatenate([e.X for e in pieces]).mean(axis=0)
     reach = HELD * np.max([np.abs(e.X - centre).max(axis=0) for e in pieces], axis=0)
     for e in pieces:
@@ -239,7 +239,7 @@ def _run_row(
     row: LeaderboardRow, learned: Episodes, measured: Episodes, first: int, horizon: int
 ) -> tuple[LeaderboardRow, FreeRun]:
     """Return how a row's model runs, and the row: of measured rows, or lifted at each step, where that is better."""
-    fit = partial(_fit_quietly, row.candidate, row.ridge)
+    fit = partial(fit_quietly, row.candidate, row.ridge)
     run = judge_free_run(fit, learned, measured, first, horizon, relift=row.bilinear)
     if learned is not measured:
         raw = judge_free_run(fit, measured, measured, first, horizon, relift=row.bilinear)
@@ -257,12 +257,12 @@ def _choose_run(rows: Sequence[LeaderboardRow], runs: Mapping[int, FreeRun], kin
     same = [i for i in runs if kind in (None, rows[i].kind)]
     plain = [i for i in same if not isinstance(rows[i].structure, HiddenStructure)]
     least = min((rows[i].free for i in plain), default=np.inf)
-    those = [i for i in same if i in plain or rows[i].free < _PAYS * least]
+    those = [i for i in same if i in plain or rows[i].free < PAYS * least]
     sizes = [rows[i].size if i in plain else np.inf for i in those]  # of models alike one without a hidden state
     return those[choose_by_free_run([runs[i] for i in those], sizes)]
 
 
-def _fit_quietly(candidate: Candidate, ridge: float, data: Episodes) -> AnyPredictor:
+def fit_quietly(candidate: Candidate, ridge: float, data: Episodes) -> AnyPredictor:
     with hide_fit_warnings():
         return fit_candidate(candidate, data, ridge, ReadOptions())
 

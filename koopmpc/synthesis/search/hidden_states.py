@@ -19,13 +19,12 @@ from koopmpc.models.records.narx import FOLDS
 from koopmpc.models.records.state_space import search_hidden, search_neural
 from koopmpc.models.records.subspace import choose_sizes
 from koopmpc.synthesis.search.candidates import Candidate
-from koopmpc.synthesis.search.free_runs import FreeRun, cut_pieces, forecast_rows, judge_free_run, measure_spread
+from koopmpc.synthesis.search.free_runs import PAYS, FreeRun, cut_pieces, forecast_rows, judge_free_run, measure_spread
 from koopmpc.synthesis.search.leaderboard import LeaderboardRow
 from koopmpc.validate.scoring import AnyPredictor
 
 FAR = 1.2  # a kind that errs by this many times the least error is left out
 LOST = 1.0  # a model that errs by more spreads than this on one stretch is not taken where another one is calm
-PAYS = 0.9  # neurons of several orders are judged if they lower the error on unseen rows to less than this share
 NEAR = 1.5  # else the best model with neurons is judged if it errs by less than this many times the least error
 _NEURAL_ORDERS = (2, 3, 4)  # orders of hidden states with neurons
 _SENSORS = 2  # neurons are tried on records of at most so many sensors: with more of them little is hidden

@@ -19,10 +19,10 @@ from koopmpc.models.records.structure import Structure, find_forecast_horizon, f
 from koopmpc.synthesis.search.candidates import Candidate
 from koopmpc.synthesis.search.data import smooth_data
 from koopmpc.synthesis.search.free_runs import (
-    _PAYS,
-    _fit_quietly,
-    _is_calm,
+    PAYS,
     cut_pieces,
+    fit_quietly,
+    is_calm,
     is_surely_better,
     leave_quarters,
     measure_stretches,
@@ -92,7 +92,7 @@ def _race(found: Sequence[Structure], measured: Episodes) -> Structure:
         return small
     first, horizon = max(small.delays, best.delays), find_forecast_horizon(measured)
     own, other = (run_structure(one, measured, first, horizon) for one in (small, best))
-    wins = other.error < _PAYS * own.error if own.calm == other.calm else other.calm
+    wins = other.error < PAYS * own.error if own.calm == other.calm else other.calm
     return best if wins else small
 
 
@@ -129,7 +129,7 @@ def refine_structure(
         refined = refine(model, truth, horizon=best, held_out=truth)
     except KoopmpcError:  # a record is too short for its segments
         return model, 0
-    calm = _is_calm(refined, truth, first, relift) or not structure.calm
+    calm = is_calm(refined, truth, first, relift) or not structure.calm
     return (refined, best) if calm else (model, 0)
 
 
@@ -144,7 +144,7 @@ def fit_again(selection: Selection, episodes: Episodes) -> AnyPredictor:
     row, data = selection.best, selection.predictor.align(episodes)
     if row.structure is None and not row.rough:
         data = smooth_data(Held(data), data)[1]
-    model = _fit_quietly(row.candidate, row.ridge, data)
+    model = fit_quietly(row.candidate, row.ridge, data)
     if selection.refined:
         pieces = cut_pieces(data)
         if max(map(len, pieces)) >= selection.refined + max(DELAYS):
