@@ -185,6 +185,7 @@ def forecast_rows(
 
 
 def is_calm(model: AnyPredictor, pieces: Episodes, first: int, relift: bool) -> bool:
+    """Return whether free runs over each record twice stay within three times the range of the data."""
     centre = np.concatenate([e.X for e in pieces]).mean(axis=0)
     reach = HELD * np.max([np.abs(e.X - centre).max(axis=0) for e in pieces], axis=0)
     for e in pieces:
@@ -263,6 +264,7 @@ def _choose_run(rows: Sequence[LeaderboardRow], runs: Mapping[int, FreeRun], kin
 
 
 def fit_quietly(candidate: Candidate, ridge: float, data: Episodes) -> AnyPredictor:
+    """Return the model of these data; doubts about the fit stand in its report."""
     with hide_fit_warnings():
         return fit_candidate(candidate, data, ridge, ReadOptions())
 
