@@ -30,7 +30,7 @@ from koopmpc.base.parallel import map_tasks
 from koopmpc.base.terminal import build_plain_table
 from koopmpc.views.figures.reports import CurvePanel, draw_panels
 from koopmpc.views.figures.style import save
-from koopmpc.views.recording.curves import record_curves
+from koopmpc.views.recording.plots import record_curves
 
 __all__ = [
     "PAPERS",

@@ -17,7 +17,7 @@ from koopmpc.apps.bench.store import RunRow, open_sweep, read_store, record_of, 
 from koopmpc.base.page import Curves, Page
 from koopmpc.plants import routines
 from koopmpc.synthesis.designed import SavedDesign, read_controller
-from koopmpc.views.recording.curves import record_curves
+from koopmpc.views.recording.plots import record_curves
 from tests.synthesis.test_design import usual
 from tests.views.runs import make_run
 

@@ -20,6 +20,18 @@ def three_states() -> km.LinearPredictor:
     return km.LinearPredictor(A, np.ones((3, 1)), np.eye(3), km.State(), DT, ("a [m]", "b [m/s]", "c [A]"), ["u"])
 
 
+BILINEAR = km.BilinearPredictor(
+    turning().A, turning().B, np.zeros((1, 2, 2)), np.eye(2), km.State(), DT, STATES, INPUTS
+)
+DEFECTIVE = km.LinearPredictor([[0.9, 1.0], [0.0, 0.9]], [[0.0], [1.0]], np.eye(2), km.State(), DT, STATES, INPUTS)
+VALUES = np.array([1.2, -0.9, 0.5, 0.1])
+
+
+def diagonal() -> km.LinearPredictor:
+    """The eigenvalues VALUES, without an input."""
+    return km.LinearPredictor(np.diag(VALUES), np.zeros((4, 0)), np.eye(4), km.State(), 0.1, list("abcd"), [])
+
+
 def episodes(count: int = 12, steps: int = 30, noise: float = 0.0) -> km.Episodes:
     rng, model = np.random.default_rng(4), turning()
     made = []

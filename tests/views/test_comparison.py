@@ -11,11 +11,13 @@ import pytest
 import koopmpc as km
 from koopmpc.base.page import Curves, Page
 from koopmpc.loop.metrics import running_cost, total_cost
+from koopmpc.views.figures.reports import CurvePanel, draw_panels, draw_trajectories
 from koopmpc.views.figures.style import save
 from koopmpc.views.recording.comparison import record_comparison
-from koopmpc.views.recording.curves import record_curves
-from koopmpc.views.recording.reader import read_columns
+from koopmpc.views.recording.plots import record_curves
 from koopmpc.views.recording.video import export_video
+from tests.views.logged import Logged
+from tests.views.models import turning
 from tests.views.runs import make_run
 
 
@@ -70,15 +72,15 @@ def test_the_cost_so_far_grows_by_the_cost_of_each_step_and_ends_at_that_of_the_
 
 def test_each_run_is_a_curve_of_every_plot_and_a_column_of_the_table(logs: list[Path], tmp_path: Path) -> None:
     record_comparison(logs, tmp_path / "both.rrd")
-    drawn = read_columns(tmp_path / "both.rrd", ("/**",))
+    drawn = Logged(tmp_path / "both.rrd")
     runs = [km.load_run(log) for log in logs]
     for r, run in enumerate(runs, 1):
-        assert drawn.matrix(f"/state/0/{r}")[1][:, 0] == pytest.approx(run.X[:, 0])
-        assert drawn.matrix(f"/input/0/{r}")[1][:, 0] == pytest.approx(run.U[:, 0])
-        assert drawn.matrix(f"/cost/{r}")[1][-1, 0] == pytest.approx(km.metrics(run).cost)
-        assert drawn.static(f"/state/0/{r}", "names") == ("one", "two")[r - 1]
-    assert drawn.static("/state/0/mark/0", "names") == "reference"
-    assert "| metric | one | two |" in drawn.static("/metrics", "text")
+        assert drawn.matrix(f"state/0/{r}")[1][:, 0] == pytest.approx(run.X[:, 0])
+        assert drawn.matrix(f"input/0/{r}")[1][:, 0] == pytest.approx(run.U[:, 0])
+        assert drawn.matrix(f"cost/{r}")[1][-1, 0] == pytest.approx(km.metrics(run).cost)
+        assert drawn.static(f"state/0/{r}", "names") == [("one", "two")[r - 1]]
+    assert drawn.static("state/0/mark/0", "names") == ["reference"]
+    assert "| metric | one | two |" in drawn.static("metrics", "text")[0]
 
 
 def test_logs_that_cannot_be_compared_say_why(logs: list[Path], tmp_path: Path) -> None:
@@ -113,18 +115,6 @@ def test_what_no_video_can_be_made_of_says_why(logs: list[Path], tmp_path: Path)
         export_video(tmp_path / "plain.rrd", tmp_path / "out.gif")
 
 
-def written(path):
-    from rerun.chunk import RrdReader
-
-    found = {}
-    for chunk in RrdReader(path).stream().to_chunks():
-        batch = chunk.to_record_batch()
-        for name in batch.schema.names:
-            if name.split(":")[-1] in ("scalars", "text"):
-                found.setdefault(chunk.entity_path, []).extend(batch.column(name).to_pylist())
-    return found
-
-
 def test_curves_come_back_and_gaps_stay_gaps(tmp_path):
     truth = np.arange(10.0).reshape(5, 2)
     holed = truth + 0.5
@@ -132,13 +122,12 @@ def test_curves_come_back_and_gaps_stay_gaps(tmp_path):
     holed[:, 1] = np.nan  # no entity at all: a timeline without a row ends the viewer
     tab = Curves("one, two", 0.1, ("x [m]", "v [m/s]"), {"truth": truth, "model a": holed})
     record_curves([tab], tmp_path / "deep" / "c.rrd", application="koopmpc-test", page="# Uᵀ")
-    found = written(tmp_path / "deep" / "c.rrd")
-    flat = {entity: [row[0] for row in rows] for entity, rows in found.items()}
-    assert flat["/one_two/x_m/0_truth"] == truth[:, 0].tolist()
-    assert flat["/one_two/x_m/1_model_a"] == [0.5, 4.5, 6.5, 8.5]
-    assert flat["/one_two/v_m_s/0_truth"] == truth[:, 1].tolist()
-    assert "/one_two/v_m_s/1_model_a" not in flat
-    assert flat["/page"] == ["# U^T"]
+    log = Logged(tmp_path / "deep" / "c.rrd")
+    np.testing.assert_array_equal(log.matrix("one_two/x_m/0_truth")[1], truth[:, :1])
+    assert log.rows("one_two/x_m/1_model_a") == ([0, 2, 3, 4], [[0.5], [4.5], [6.5], [8.5]])
+    np.testing.assert_array_equal(log.matrix("one_two/v_m_s/0_truth")[1], truth[:, 1:])
+    assert "one_two/v_m_s/1_model_a" not in log.entities
+    assert log.static("page", "text") == ["# U^T"]
 
 
 TAB = Curves("one", 0.1, ("x",), {"truth": np.zeros((3, 1))})
@@ -180,3 +169,58 @@ def test_a_picture_that_cannot_be_saved_leaves_the_report_as_it_was(tmp_path):
     with pytest.raises(km.errors.LogError, match="is a folder"):
         page.picture("one", "A picture", partial(save, matplotlib.figure.Figure()))
     assert page.parts == []
+
+
+def test_every_curve_is_drawn_in_its_panel_with_one_look_a_name():
+    t = np.linspace(1.0, 2.0, 5)
+    one = CurvePanel("t [s]", "x", {"a": (t, t), "b": (t, -t)}, log="x", at=[0.5], ylim=(-3.0, 3.0))
+    two = CurvePanel("t [s]", "y", {"b": (t[:3], t[:3])}, title="second", points=True, log="y")
+    made = draw_panels([one, two, two])
+    first, second, third, empty = made.axes
+    assert [curve.get_label() for curve in first.get_lines()[1:]] == ["a", "b"]
+    assert first.get_lines()[2].get_color() == second.get_lines()[0].get_color()
+    assert first.get_xscale() == second.get_yscale() == "log"
+    assert first.get_ylim() == (-3.0, 3.0)
+    assert second.get_title() == third.get_title() == "second"
+    np.testing.assert_array_equal(second.get_lines()[0].get_xdata(), t[:3])
+    assert not empty.get_visible()
+
+
+def test_no_panel_and_curves_of_two_lengths_are_refused():
+    with pytest.raises(km.errors.DataError, match="there is no panel to draw"):
+        draw_panels([])
+    with pytest.raises(km.errors.ShapeError, match="'a' has 3 x and 2 y; pass one y for each x"):
+        draw_panels([CurvePanel("x", "y", {"a": ([0, 1, 2], [0, 1])})])
+
+
+def test_runs_of_a_report_show_the_limits_that_are_near() -> None:
+    plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    limits = km.Limits(u_min=-5, u_max=5, x_max={"theta": 400, "omega": 0.3})
+    mpc = km.LinearMPC(plant, [0, 0], [0], km.Cost(Q=[10, 1], R=0.01), limits, horizon=10)
+    run = km.simulate(plant, mpc, x0=[0.3, 0], reference=[0, 0], steps=30, limits=limits)
+    theta, omega, torque = draw_trajectories({"mpc": run}).axes
+    lines = [
+        [float(line.get_ydata()[0]) for line in panel.lines if line.get_label() == "limit"]
+        for panel in (theta, omega, torque)
+    ]
+    assert lines == [[400], [0.3], [-5, 5]]
+    assert theta.get_ylim()[1] < 1  # a limit far away does not flatten the curve
+    assert omega.get_ylim()[1] > 0.3
+    assert torque.get_ylim()[0] < -5
+
+
+def test_runs_of_a_report_show_a_reference_of_their_states_alone() -> None:
+    model, limits = turning(), km.Limits(-9, 9)
+    for cost, columns, drawn in ((km.Cost(1, 1), 2, True), (km.Cost(1, 1, of=km.State([1])), 1, False)):
+        mpc = km.KoopmanMPC(model, cost, limits, 4)
+        run = km.simulate(model.step_map(), mpc, x0=[1, 0], reference=[0.5, 0.2][:columns], steps=5, cost=cost)
+        shown = [
+            [line.get_ydata().tolist() for line in panel.lines if line.get_label() == "reference"]
+            for panel in draw_trajectories({"mpc": run}).axes
+        ]
+        assert shown == ([[[0.5] * 6], [[0.2] * 6], []] if drawn else [[], [], []])
+    run = km.simulate(model.step_map(), lambda y, r: np.zeros(1), x0=[1, 0], reference=[0.5], steps=5)
+    assert run.cost is None
+    assert not any(
+        line.get_label() == "reference" for panel in draw_trajectories({"law": run}).axes for line in panel.lines
+    )

@@ -10,18 +10,10 @@ import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.loop.rows import StepRows
-from koopmpc.loop.run import About
-from koopmpc.views.recording.blocks import block_of_run, blocks
-from koopmpc.views.recording.description import _FORMAT, DRAWN, drawable, from_json, title_of, to_json, to_markdown
-from koopmpc.views.recording.reader import LogColumns, read_columns
-from koopmpc.views.recording.scenes import ReferenceScenes
 from tests.control.models import step_map
-from tests.fixtures.logs.make import FOLDER as LOGS
-from tests.fixtures.logs.make import made
+from tests.views.logged import Logged
 from tests.views.runs import make_run, options
 
 
@@ -39,7 +31,7 @@ def test_a_log_without_the_solvers_of_its_steps_reads_as_before(tmp_path: Path) 
     """Logs of before have no such column, and neither has one whose steps asked no solver."""
     run = replace(make_run(), solver=())
     km.record(run, tmp_path / "run.rrd")
-    assert "/solver/qp" not in read_columns(tmp_path / "run.rrd", ("/solver/qp", "/state")).entities()
+    assert "solver/qp" not in Logged(tmp_path / "run.rrd").entities
     assert km.load_run(tmp_path / "run.rrd") == run
     assert km.metrics(run).solver == {}
 
@@ -95,21 +87,6 @@ def test_a_scene_whose_shapes_change_is_refused(ahead: bool, tmp_path: Path) -> 
         km.record(run, tmp_path / "run.rrd", scene=scene)
 
 
-@settings(max_examples=30)
-@given(T=st.integers(1, 12), least=st.integers(1, 4), most=st.integers(1, 6), k=st.integers(0, 5))
-def test_blocks_joined_are_the_run_again(T: int, least: int, most: int, k: int) -> None:
-    run = make_run(T=T, N=2)
-    rows = replace(block_of_run(run), k=k, planned=np.arange(k, k + T))
-    parts = blocks(rows, least, most)
-    assert len(parts) <= most
-    assert all(len(part.U) >= min(least, T) for part in parts)
-    assert [part.k for part in parts] == [k + sum(len(p.U) for p in parts[:i]) for i in range(len(parts))]
-    assert km.Run(**StepRows.join(parts).columns(), **run.about()) == replace(run, plans=None)
-    assert all(np.array_equal(p.planned, p.k + np.arange(len(p.U))) for p in parts)
-    assert np.array_equal(np.concatenate([p.plan_X for p in parts]), run.plans.X)
-    assert np.array_equal(np.concatenate([p.plan_U for p in parts]), run.plans.U)
-
-
 def test_plans_of_a_model_of_the_outputs_are_recorded_and_drawn_where_the_plant_has_such_a_state(
     tmp_path: Path,
 ) -> None:
@@ -124,24 +101,10 @@ def test_plans_of_a_model_of_the_outputs_are_recorded_and_drawn_where_the_plant_
     for name, scene in (("plain", None), ("drawn", lambda x, u: [km.scene.Disk("bob", (float(x[0]), 0.0), 1.0)])):
         km.record(run, tmp_path / f"{name}.rrd", scene=scene)
         assert km.load_run(tmp_path / f"{name}.rrd") == run
-        log = read_columns(tmp_path / f"{name}.rrd", ("/plots/**",))
-        at, seen = log.matrix("/plots/1/ahead/3")
+        log = Logged(tmp_path / f"{name}.rrd")
+        at, seen = log.matrix("plots/1/ahead/3")
         np.testing.assert_array_equal(seen[:, 0], run.plans.X[at - 3, 3, 0])
-        assert not len(log.matrix("/plots/0/ahead/3")[0])
-
-
-@pytest.mark.parametrize("lost", [1, 40])
-def test_a_log_without_the_status_of_its_first_step_is_refused(lost: int, tmp_path: Path, monkeypatch) -> None:
-    km.record(make_run(), tmp_path / "run.rrd")
-    rows = LogColumns.rows
-
-    def shortened(log: LogColumns, entity: str, component: str = "scalars") -> Any:
-        found = rows(log, entity, component)
-        return tuple(each[lost:] for each in found) if entity == "solver/status" else found
-
-    monkeypatch.setattr(LogColumns, "rows", shortened)
-    with pytest.raises(km.errors.LogError, match="lacks the status of its first step"):
-        km.load_run(tmp_path / "run.rrd")
+        assert not log.rows("plots/0/ahead/3")[0]
 
 
 def test_each_plan_is_drawn_whole_across_the_blocks_of_a_log(tmp_path: Path) -> None:
@@ -149,11 +112,10 @@ def test_each_plan_is_drawn_whole_across_the_blocks_of_a_log(tmp_path: Path) -> 
     assert run.plans is not None
     run.plans.U[[7, 114], 1] = np.nan  # what is missing of one plan leaves nothing out of the others
     run.plans.X[[9, 114], 1] = np.nan
-    assert len(blocks(block_of_run(run))) == 2
     km.record(run, tmp_path / "run.rrd")
-    log = read_columns(tmp_path / "run.rrd", ("/plots/**",))
+    log = Logged(tmp_path / "run.rrd")
     for j in (1, 2, 3):
-        drawn = [log.matrix(f"/plots/{name}/ahead/{j}") for name in (0, 1, "u")]
+        drawn = [log.matrix(f"plots/{name}/ahead/{j}") for name in (0, 1, "u")]
         assert [at.tolist() for at, _ in drawn] == [list(range(j, 231))] * 3
         first = slice(231 - j)
         np.testing.assert_array_equal(np.hstack([drawn[i][1] for i in (0, 1)]), run.plans.X[first, j])
@@ -242,7 +204,7 @@ def test_metadata_that_is_no_data_is_refused_before_a_file_is_made(tmp_path: Pat
 def test_what_is_only_for_people_who_look_is_in_the_log_as_well(tmp_path: Path, seed: int) -> None:
     run = make_run(T=12, nu=2, seed=seed)
     km.record(run, tmp_path / "run.rrd")
-    log = read_columns(tmp_path / "run.rrd", tuple(f"/{entity}" for entity in DRAWN))
+    log = Logged(tmp_path / "run.rrd")
     ends, deadline = log.matrix("solver/deadline_ms")
     assert ends.tolist() == [0, 12]
     assert deadline == pytest.approx(1e3 * run.dt)
@@ -253,11 +215,11 @@ def test_what_is_only_for_people_who_look_is_in_the_log_as_well(tmp_path: Path, 
     begun = [
         k for k in range(12) if pairs[k][1] is not km.control.Fallback.NONE and (not k or pairs[k] != pairs[k - 1])
     ]
-    steps, _, texts = log.rows("log", "text")
-    assert steps.tolist() == begun
-    assert [text.split(":")[0] for text in texts.to_pylist()] == [f"step {k}" for k in begun]
+    steps, texts = log.rows("log", "text")
+    assert steps == begun
     words = [run.fallback[k].name.lower().replace("_", " ") for k in begun]
-    assert [text.split("then ")[1] for text in texts.to_pylist()] == words
+    assert [text.split(":")[0] for (text,) in texts] == [f"step {k}" for k in begun]
+    assert [text.split("then ")[1] for (text,) in texts] == words
 
 
 def test_a_log_draws_the_plants_scene_the_controllers_eigenvalues_and_the_reference_unasked(tmp_path: Path) -> None:
@@ -275,96 +237,52 @@ def test_a_log_draws_the_plants_scene_the_controllers_eigenvalues_and_the_refere
         options=km.loop.LoopOptions(plans=True),
     )
     km.record(run, tmp_path / "run.rrd")
-    log = read_columns(tmp_path / "run.rrd", ("/world/**", "/model/**", "/plots/**", "/title"))
-    drawn = {entity for entity, _ in log._parts}
-    assert {"/world/bob", "/world/reference/bob", "/world/prediction/bob", "/model/eigenvalues", "/title"} <= drawn
-    bob = np.array(log.rows("/world/reference/bob", "strips")[2].flatten().to_pylist(), dtype=float)
+    log = Logged(tmp_path / "run.rrd")
+    assert {"world/bob", "world/reference/bob", "world/prediction/bob", "model/eigenvalues"} <= log.entities
+    bob = np.array(log.rows("world/reference/bob", "strips")[1], dtype=float)
     assert bob.reshape(-1, 2).mean(axis=0) == pytest.approx([2 * np.sin(0.2), -2 * np.cos(0.2)], abs=1e-3)
-    assert "LQR" not in (title := log.static("/title", "text"))
-    assert title == "**theta, omega · KoopmanMPC**"
+    assert log.static("title", "text") == ["**theta, omega · KoopmanMPC**"]
     for j in (1, 10):  # at the cursor, the dots j steps ahead are the current plan's
-        at, theta = log.matrix(f"/plots/0/ahead/{j}")
+        at, theta = log.matrix(f"plots/0/ahead/{j}")
         assert run.plans is not None
         assert theta[:, 0] == pytest.approx(run.plans.X[at - j, j, 0])
         assert at[-1] == run.steps
     assert km.load_run(tmp_path / "run.rrd") == run
 
 
-def test_an_angle_that_is_tracked_by_its_sine_and_cosine_is_drawn_where_it_is(tmp_path: Path) -> None:
-    cost = km.Cost(Q=[1, 1], R=1, of=km.Fourier(1, states="theta"))
-    about = About(cost=cost, limits=None, dt=0.1, states=("theta", "omega"), inputs=("u",), outputs=("theta", "omega"))
-    aims = ReferenceScenes(about)
-    for angle in np.linspace(-3, 3, 13):
-        x = aims._state(np.array([np.sin(angle), np.cos(angle)]))
-        assert x is not None
-        assert np.angle(np.exp(1j * (x[0] - angle))) == pytest.approx(0, abs=1e-4)
-    assert aims._state(np.array([2.0, 0.0])) is None  # no angle has such a sine
-
-
-def test_a_log_of_todays_format_reads_to_the_bit() -> None:
-    assert km.load_run(LOGS / f"{_FORMAT}.rrd") == made()
-
-
-def test_a_log_of_an_earlier_format_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr("koopmpc.views.recording.description._FORMAT", "koopmpc-log-1")
-        km.record(made(), tmp_path / "old.rrd")
-    with pytest.raises(km.errors.LogError, match=r"has format 'koopmpc-log-1', this koopmpc reads 'koopmpc-log-2'"):
-        km.load_run(tmp_path / "old.rrd")
-
-
-def test_what_the_font_holds_stays_as_it_is() -> None:
-    text = "θ̇ [rad/s], x̂ − Φ⁺ψ(x₁) ≤ 10⁻⁴ √2 · ‖x‖ Жč\n| a | – |"
-    assert drawable(text) == text
-
-
-def test_what_the_font_lacks_is_spelled_otherwise() -> None:
-    assert drawable("Uᵀ𝜓 ∈ ℝ") == "U^Tψ  in  R"
-    assert drawable("位置 [m] 😀") == "?? [m] ?"
-
-
-@settings(max_examples=40, deadline=None)
-@given(text=st.text())
-def test_text_that_can_be_drawn_is_left_alone(text: str) -> None:
-    once = drawable(text)
-    assert drawable(once) == once
-
-
-def test_the_description_says_what_ran_and_with_what() -> None:
+def test_the_description_says_what_ran_and_with_what_in_signs_that_the_viewer_has(tmp_path: Path) -> None:
     told = {
         "problem": "pendulum",
         "case": "upright",
         "controller": "lqr",
         "seed": 7,
         "versions": {"casadi": "9.9"},
+        "noted": "Uᵀ𝜓 ∈ ℝ, θ̇ ≤ 10⁻⁴, 位置 😀",
     }
-    page = to_markdown(About(**make_run(metadata=told).about()))
+    km.record(make_run(metadata=told), tmp_path / "run.rrd")
+    (page,) = Logged(tmp_path / "run.rrd").static("description", "text")
     assert page.startswith("# pendulum · upright · lqr")
-    for part in (
-        "| seed | 7 |",
-        "casadi 9.9",
-        "| u_max | [",
-        "state 0 [m]",
-        "written with",
-        "rerun-sdk 0.41",
-    ):
+    signs = "U^Tψ  in  R, θ̇ ≤ 10⁻⁴, ?? ?"  # of those that its font lacks, other spellings
+    for part in ("| seed | 7 |", "casadi 9.9", "| u_max | [", "state 0 [m]", "written with", "rerun-sdk 0.41"):
         assert part in page
-
-
-def test_the_description_is_exact_data() -> None:
-    run = make_run(metadata={"a": [1, 2.5, None], "b": {"c": float("nan")}, "d": np.arange(3.0)})
-    about, steps = from_json(to_json(About(**run.about()), 20))
-    assert about == About(**run.about())
-    assert steps == 20
+    assert signs in page
 
 
 def test_a_run_has_a_title_of_its_own(tmp_path: Path) -> None:
-    plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
-    told = {"title": "bench 3, new valve"}
-    run = km.simulate(
-        plant, lambda y, r: [0.0], x0=[0.5, 0], reference=[0, 0], steps=5, options=km.loop.LoopOptions(metadata=told)
-    )
-    km.record(run, tmp_path / "run.rrd")
-    assert title_of(km.load_run(tmp_path / "run.rrd")) == "bench 3, new valve"
     problem = {"title": "Pendulum: driven upright.", "problem": "pendulum", "case": "hang", "controller": "lqr"}
-    assert title_of(About(**make_run(metadata=problem).about())) == "pendulum · hang · lqr"
+    for told, title in (({"title": "bench 3, new valve"}, "bench 3, new valve"), (problem, "pendulum · hang · lqr")):
+        km.record(make_run(metadata=told), tmp_path / "run.rrd")
+        assert Logged(tmp_path / "run.rrd").static("title", "text") == [f"**{title}**"]
+
+
+def test_an_angle_that_is_tracked_by_its_sine_and_cosine_is_drawn_where_it_is(tmp_path: Path) -> None:
+    angles = np.linspace(-3, 3, 13)
+    aims = np.column_stack([np.sin(angles), np.cos(angles)])
+    aims[0] = 2.0, 0.0  # no angle has such a sine
+    cost = km.Cost(Q=[1, 1], R=1, of=km.Fourier(1, states=[0]))
+    run = replace(make_run(T=12, N=None, limits=False), reference=aims, cost=cost)
+    km.record(run, tmp_path / "run.rrd", scene=lambda x, u: [km.scene.Disk("a", (np.cos(x[0]), np.sin(x[0])), 0.1)])
+    at, strips = Logged(tmp_path / "run.rrd").rows("world/reference/a", "strips")
+    assert at == list(range(1, 13))
+    x, y = np.array([np.mean(strip[0], axis=0) for strip in strips]).T
+    np.testing.assert_allclose(np.exp(1j * np.arctan2(-y, x)), np.exp(1j * angles[1:]), atol=1e-3)

@@ -1,48 +1,63 @@
 """Scenes: in the plane shapes become lines that cover what they stand for, y down; in space lines, balls and boxes, z up."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
 import koopmpc as km
-from koopmpc.views.figures.animation import project
-from koopmpc.views.recording.scenes import Extent, Names, draw, draw_ahead, stages
-from koopmpc.views.recording.video import export_video
+from tests.commands import koopmpc
+from tests.views.logged import Logged
 from tests.views.runs import make_run
 
-coordinate = st.floats(-10, 10)
+
+def drawn(path: Path, draw: Callable, X: Sequence = (0.0,), plans: np.ndarray | None = None) -> Logged:
+    """Return the log of a run through the states X that draws draw(x); `plans` has N + 1 states for each step."""
+    X = np.array([*X, X[-1]], dtype=float)[:, None]
+    T, zeros = len(X) - 1, np.zeros((len(X) - 1, 1))
+    ahead = None if plans is None else km.loop.Plans(plans[..., None], np.zeros((T, plans.shape[1] - 1, 1)))
+    run = km.Run(
+        X=X, Y=X, U=zeros, reference=np.empty((T + 1, 0)), status=(km.Status.OPTIMAL,) * T, solve_time=np.ones(T),
+        fallback=(km.control.Fallback.NONE,) * T, cost=None, limits=None, dt=0.1, states=("x",), inputs=("u",),
+        outputs=("x",), plans=ahead,
+    )  # fmt: skip
+    km.record(run, path, scene=lambda x, u: draw(float(x[0])))
+    return Logged(path)
 
 
-def named(*shapes: km.scene.Shape) -> Names:
-    """Return the names of a scene of these shapes."""
-    names = Names()
-    names.check(shapes, 0)
-    return names
+def strips(log: Logged, entity: str) -> list[np.ndarray]:
+    """Return the strips of the first row of an entity, y up."""
+    return [np.array(strip) * (1, -1) for strip in log.rows(entity, "strips")[1][0]]
 
 
-def strips(columns: object) -> list[list[list[tuple[float, float]]]]:
-    """Return the strips of every row of a drawing."""
-    column = next(c for c in columns if "strips" in str(c.component_descriptor()))
-    return column.as_arrow_array().to_pylist()
+def ranges(path: Path) -> np.ndarray:
+    """Return the ranges of x and y that the animation shows."""
+    from rerun.chunk import RrdReader
+
+    entry = RrdReader(path).blueprints()[-1]
+    for chunk in RrdReader(path).stream(store=entry).to_chunks():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if name.endswith("VisualBounds2D:range"):
+                found = batch.column(name).to_pylist()[-1][0]
+                return np.array([found["x_range"], found["y_range"]])
+    raise AssertionError("the animation has no ranges")
 
 
-@given(x=coordinate, y=coordinate, angle=st.floats(-4, 4), width=st.floats(0.1, 3), height=st.floats(0.1, 3))
-def test_a_box_is_covered_and_no_more(x: float, y: float, angle: float, width: float, height: float) -> None:
-    box = km.scene.Box("box", (x, y), (width, height), angle)
-    drawing = draw(named(box), [[box]], Extent())["box"]
-    path = np.array(strips(drawing.columns)[0][0]) * (1, -1) - (x, y)
+@pytest.mark.parametrize("seed", range(12))
+def test_a_box_is_covered_and_no_more(seed: int, tmp_path: Path) -> None:
+    rng = np.random.default_rng(seed)
+    (x, y, angle), size = rng.uniform(-4, 4, 3), rng.uniform(0.1, 3, 2)
+    log = drawn(tmp_path / "run.rrd", lambda _: [km.scene.Box("box", (x, y), tuple(size), angle)])
+    (path,) = strips(log, "world/box")
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    local, r = path @ turn, min(width, height) / 8
-    reach = np.abs(local).max(axis=0) + r
-    np.testing.assert_allclose(reach, [width / 2, height / 2], atol=1e-4)
-    inside = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2)) * (np.array([width, height]) - 2 * r)
+    local, r = (path - (x, y)) @ turn, min(size) / 8
+    np.testing.assert_allclose(np.abs(local).max(axis=0) + r, size / 2, atol=1e-4)
+    inside = rng.uniform(-0.5, 0.5, (50, 2)) * (size - 2 * r)
     assert max(distance(point, local) for point in inside) <= r + 1e-4
 
 
@@ -53,12 +68,6 @@ def distance(point: np.ndarray, path: np.ndarray) -> float:
     return float(np.linalg.norm(point - a - t[:, None] * d, axis=1).min())
 
 
-def test_up_in_the_scene_is_up_in_the_viewer() -> None:
-    rod = km.scene.Line("rod", [(0.0, 0.0), (1.0, 2.0)])
-    columns = draw(named(rod), [[rod]], Extent())["rod"].columns
-    assert np.array(strips(columns)).tolist() == [[[[0.0, 0.0], [1.0, -2.0]]]]
-
-
 @pytest.mark.parametrize(
     ("shape", "low", "high"),
     [
@@ -67,76 +76,60 @@ def test_up_in_the_scene_is_up_in_the_viewer() -> None:
         (km.scene.Box("s", (0.0, 0.0), (2.0, 4.0), np.pi / 2), (-2.0, -1.0), (2.0, 1.0)),
     ],
 )
-def test_extent_hold_every_shape_whole(shape: km.scene.Shape, low: tuple, high: tuple) -> None:
-    extent = Extent()
-    draw(named(shape), [[shape], []], extent)
-    np.testing.assert_allclose(extent.drawn.low, low, atol=1e-3)
-    np.testing.assert_allclose(extent.drawn.high, high, atol=1e-3)
-    (x0, x1), (y0, y1) = extent.ranges()
+def test_the_animation_shows_every_shape_whole_and_up_is_up(
+    shape: km.scene.Shape, low: tuple, high: tuple, tmp_path: Path
+) -> None:
+    log = drawn(path := tmp_path / "run.rrd", lambda _: [shape, km.scene.Line("nowhere", [])])
+    if isinstance(shape, km.scene.Line):
+        np.testing.assert_array_equal(strips(log, "world/s")[0], shape.points)
+    (x0, x1), (y0, y1) = ranges(path)
     assert x0 < low[0] < high[0] < x1
     assert y0 < -high[1] < -low[1] < y1
+    margin = 0.06 * max(high[0] - low[0], high[1] - low[1])
+    np.testing.assert_allclose([x1 - high[0], y1 + low[1]], margin, atol=1e-3)
 
 
-def test_nothing_drawn_has_no_extent() -> None:
-    extent = Extent()
-    draw(named(km.scene.Line("nowhere", [])), [[km.scene.Line("nowhere", [(np.nan, 0.0), (0.0, 0.0)])]], extent)
-    assert extent.ranges() is None
-
-
-def test_only_what_moves_is_drawn_ahead_and_fades() -> None:
-    rail, cart = (
-        km.scene.Line("rail", [(0.0, 0.0), (1.0, 0.0)]),
-        km.scene.Disk("cart", (0.0, 0.0), 0.1, color=(0, 0, 0)),
+def test_only_what_moves_is_drawn_ahead_and_fades(tmp_path: Path) -> None:
+    rail = km.scene.Line("rail", [(0.0, 0.0), (1.0, 0.0)])
+    plans = np.array([[0.0, 1.0, 2.0], [np.nan] * 3])
+    log = drawn(
+        tmp_path / "run.rrd", lambda x: [rail, km.scene.Disk("cart", (x, 0.0), 0.1, color=(0, 0, 0))], (0, 0), plans
     )
-    ahead = [[rail, km.scene.Disk("cart", (float(i), 0.0), 0.1, color=(0, 0, 0))] for i in (1, 2)]
-    drawings = draw_ahead(named(rail, cart), [[rail, cart], [rail, cart]], [ahead, []], extent := Extent())
-    assert [len(row) for row in strips(drawings["rail"].columns)] == [0, 0]
-    assert [len(row) for row in strips(drawings["cart"].columns)] == [2, 0]
-    colors = next(c for c in drawings["cart"].columns if "colors" in str(c.component_descriptor()))
-    far, near = (value >> 24 for value in colors.as_arrow_array().to_pylist()[0])
+    assert log.rows("world/prediction/rail", "strips")[0] == []
+    assert [round(strip[:, 0].mean()) for strip in strips(log, "world/prediction/cart")] == [2, 1]
+    at, colors = log.rows("world/prediction/cart", "colors")
+    assert at == [0]
+    far, near = (value >> 24 for value in colors[0])
     assert 0 < near < far < 247
-    assert extent.predicted.high[0] == pytest.approx(2.1, abs=1e-3)
 
 
-@given(horizon=st.integers(1, 200))
-def test_the_last_stage_is_always_among_those_drawn(horizon: int) -> None:
-    drawn = stages(horizon)
-    assert drawn[-1] == horizon
-    assert drawn == sorted(set(drawn))
-    assert 1 <= len(drawn) <= 4
-    assert drawn[0] >= 1
+@pytest.mark.parametrize("horizon", [1, 2, 3, 4, 5, 50, 199])
+def test_the_last_stage_is_always_among_those_drawn(horizon: int, tmp_path: Path) -> None:
+    plan = np.arange(horizon + 1.0)[None]
+    log = drawn(tmp_path / "run.rrd", lambda x: [km.scene.Disk("d", (x, 0.0), 0.1)], plans=plan)
+    stages = [round(strip[:, 0].mean()) for strip in strips(log, "world/prediction/d")]
+    assert stages[0] == horizon
+    assert stages == sorted(set(stages), reverse=True)
+    assert 1 <= len(stages) <= 4
+    assert stages[-1] >= 1
 
 
-def test_a_prediction_that_diverges_does_not_push_the_scene_out_of_sight() -> None:
-    extent, now, near, far = (
-        Extent(),
-        [[km.scene.Disk("d", (0.0, 0.0), 1.0)]],
-        km.scene.Disk("d", (0.2, 0.0), 1.0),
-        km.scene.Disk("d", (1e6, 0.0), 1.0),
-    )
-    draw(named(near), now, extent)
-    alone = extent.ranges()
-    draw_ahead(named(near), now, [[[near]]], extent)
-    assert extent.ranges()[0][1] - alone[0][1] == pytest.approx(0.2, abs=1e-3)
-    draw_ahead(named(near), now, [[[far]]], extent)
-    assert 0.2 < extent.ranges()[0][1] - alone[0][1] < 1.0
-    assert extent.ranges()[0][0] == alone[0][0]
+def test_a_prediction_that_diverges_does_not_push_the_scene_out_of_sight(tmp_path: Path) -> None:
+    shown = {}
+    for end in (0.0, 0.2, 1e6):
+        drawn(path := tmp_path / "run.rrd", lambda x: [km.scene.Disk("d", (x, 0.0), 1.0)], plans=np.array([[0.0, end]]))
+        shown[end] = ranges(path)[0]
+    assert shown[0.2][1] - shown[0.0][1] == pytest.approx(0.2, abs=1e-3)
+    assert 0.2 < shown[1e6][1] - shown[0.0][1] < 1.0
+    assert shown[1e6][0] == shown[0.0][0]
 
 
-def test_a_shape_that_comes_or_goes_is_named() -> None:
-    rail, cart = km.scene.Line("rail", [(0.0, 0.0)]), km.scene.Disk("cart", (0.0, 0.0), 0.1)
-    names = Names()
-    assert names.check((rail, cart, rail), 0) == [rail, cart, rail]
-    assert names.check([cart, rail], 1) == [cart, rail]
-    assert list(names) == ["rail", "cart"]
-    with pytest.raises(
-        km.errors.DataError, match="the scene of step 2 lacks the shape 'cart'; a scene returns the same"
-    ):
-        names.check([rail], 2)
-    with pytest.raises(
-        km.errors.DataError, match="the scene of step 3 has a new shape 'wall'; a scene returns the same"
-    ):
-        names.check([rail, cart, km.scene.Line("wall", [])], 3)
+def test_a_shape_that_comes_or_goes_is_named(tmp_path: Path) -> None:
+    rail, cart, wall = (km.scene.Disk(name, (0.0, 0.0), 0.1) for name in ("rail", "cart", "wall"))
+    drawn(tmp_path / "run.rrd", lambda x: [rail, cart, rail] if x < 1 else [cart, rail], (0, 1))
+    for scene, told in (([rail], "lacks the shape 'cart'"), ([rail, cart, wall], "has a new shape 'wall'")):
+        with pytest.raises(km.errors.DataError, match=f"the scene of step 1 {told}; a scene returns the same"):
+            drawn(tmp_path / "run.rrd", lambda x, scene=scene: [rail, cart] if x < 1 else scene, (0, 1))
 
 
 class Satellite(km.Dynamics):
@@ -172,49 +165,29 @@ def recorded(path: Path, dynamics: km.Dynamics | None = None) -> km.Run:
     return run
 
 
-def logged(path: Path, entity: str, component: str) -> list[list[object]]:
-    """Return the values of a component of an entity, a row each step."""
-    for chunk in RrdReader(str(path)).stream().filter(content=entity, has_timeline="step"):
-        batch = chunk.to_record_batch()
-        for name in batch.schema.names:
-            if name.endswith(component):
-                return batch.column(name).to_pylist()
-    raise AssertionError(f"{entity} has no {component}")
-
-
 def test_a_scene_in_space_stands_in_the_log_where_it_was_drawn(tmp_path: Path) -> None:
     run = recorded(path := tmp_path / "run.rrd")
-    angles = run.X[:, 0]
+    angles, log = run.X[:, 0], Logged(path)
     tips = np.column_stack([np.cos(angles), np.sin(angles), 0.5 + 0 * angles])
-    booms, balls = logged(path, "/world/boom", "strips"), logged(path, "/world/tip", "positions")
+    booms, balls = log.rows("world/boom", "strips")[1], log.rows("world/tip", "positions")[1]
     assert len(booms) == len(balls)
     np.testing.assert_allclose([row[0][1] for row in booms], tips[: len(booms)], atol=1e-6)
     np.testing.assert_allclose([row[0] for row in balls], tips[: len(balls)], atol=1e-6)
-    assert logged(path, "/world/tip", "radii")[0] == pytest.approx([0.2])
-    assert logged(path, "/world/boom", "radii")[0] == pytest.approx([0.05])
-    np.testing.assert_allclose(logged(path, "/world/body", "half_sizes")[0], [[0.2, 0.3, 0.4]], atol=1e-6)
-    for row, angle in zip(logged(path, "/world/body", "quaternions"), angles, strict=False):
+    assert log.rows("world/tip", "radii")[1][0] == pytest.approx([0.2])
+    assert log.rows("world/boom", "radii")[1][0] == pytest.approx([0.05])
+    np.testing.assert_allclose(log.rows("world/body", "half_sizes")[1][0], [[0.2, 0.3, 0.4]], atol=1e-6)
+    for row, angle in zip(log.rows("world/body", "quaternions")[1], angles, strict=False):
         found = Rotation.from_quat(row[0]).apply([1.0, 0.0, 0.0])
         np.testing.assert_allclose(found, [np.cos(angle), np.sin(angle), 0.0], atol=1e-6)
-    for row, angle in zip(logged(path, "/world/panel", "quaternions"), angles, strict=False):  # about the x-axis
+    for row, angle in zip(log.rows("world/panel", "quaternions")[1], angles, strict=False):  # about the x-axis
         found = Rotation.from_quat(row[0]).apply([0.0, 1.0, 0.0])
         np.testing.assert_allclose(found, [0.0, np.cos(angle), np.sin(angle)], atol=1e-6)
 
 
 def test_a_log_in_space_becomes_a_video_in_which_what_is_near_hides_what_is_far(tmp_path: Path) -> None:
     recorded(path := tmp_path / "run.rrd")
-    export_video(path, video := tmp_path / "run.gif")
+    assert koopmpc("export-video", path, video := tmp_path / "run.gif").exit_code == 0
     assert video.read_bytes()[:6] == b"GIF89a"
-
-
-def test_a_scene_seen_from_afar_keeps_up_and_lengths() -> None:
-    seen = project(points := np.random.default_rng(0).normal(size=(20, 3)))
-    np.testing.assert_allclose(np.linalg.norm(seen, axis=1), np.linalg.norm(points, axis=1), rtol=1e-12)
-    right, up, near = project(np.array([[0.0, 0.0, 1.0]]))[0]
-    assert right == pytest.approx(0.0)
-    assert up > 0.8  # the eye is above the horizon, and z points up
-    assert near > 0
-    assert np.linalg.det(project(np.eye(3))) == pytest.approx(1.0)  # no mirror
 
 
 @pytest.mark.parametrize(

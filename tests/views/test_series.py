@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.views.figures.reports import draw_trajectories
 from tests.views.models import DT, INPUTS, STATES, curve, episodes, turning
 from tests.views.runs import make_run
 
@@ -130,39 +129,6 @@ def test_a_bad_model_does_not_hide_the_good_one() -> None:
             assert rmse.max() < axes.get_ylim()[1] < 100 * rmse.max()
 
 
-def test_runs_of_a_report_show_the_limits_that_are_near() -> None:
-    plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
-    limits = km.Limits(u_min=-5, u_max=5, x_max={"theta": 400, "omega": 0.3})
-    mpc = km.LinearMPC(plant, [0, 0], [0], km.Cost(Q=[10, 1], R=0.01), limits, horizon=10)
-    run = km.simulate(plant, mpc, x0=[0.3, 0], reference=[0, 0], steps=30, limits=limits)
-    theta, omega, torque = draw_trajectories({"mpc": run}).axes
-    lines = [
-        [float(line.get_ydata()[0]) for line in panel.lines if line.get_label() == "limit"]
-        for panel in (theta, omega, torque)
-    ]
-    assert lines == [[400], [0.3], [-5, 5]]
-    assert theta.get_ylim()[1] < 1  # a limit far away does not flatten the curve
-    assert omega.get_ylim()[1] > 0.3
-    assert torque.get_ylim()[0] < -5
-
-
-def test_runs_of_a_report_show_a_reference_of_their_states_alone() -> None:
-    model, limits = turning(), km.Limits(-9, 9)
-    for cost, columns, drawn in ((km.Cost(1, 1), 2, True), (km.Cost(1, 1, of=km.State([1])), 1, False)):
-        mpc = km.KoopmanMPC(model, cost, limits, 4)
-        run = km.simulate(model.step_map(), mpc, x0=[1, 0], reference=[0.5, 0.2][:columns], steps=5, cost=cost)
-        shown = [
-            [line.get_ydata().tolist() for line in panel.lines if line.get_label() == "reference"]
-            for panel in draw_trajectories({"mpc": run}).axes
-        ]
-        assert shown == ([[[0.5] * 6], [[0.2] * 6], []] if drawn else [[], [], []])
-    run = km.simulate(model.step_map(), lambda y, r: np.zeros(1), x0=[1, 0], reference=[0.5], steps=5)
-    assert run.cost is None
-    assert not any(
-        line.get_label() == "reference" for panel in draw_trajectories({"law": run}).axes for line in panel.lines
-    )
-
-
 def find_hidden(drawing):
     """Return what is drawn outside its panel: curves, inputs, and limits that are near."""
     hidden = []
@@ -207,7 +173,7 @@ def test_what_is_drawn_is_inside_its_panel() -> None:
     assert any(beyond)
     drawings = [km.plot.rollout(grown, episode, 12) for episode in data]
     drawings += [km.plot.error({"a": km.score(swing, data, 8), "b": km.score(grown, data, 8)})]
-    drawings += [km.plot.run(runs["0.9"]), km.plot.runs({"": runs}), draw_trajectories(runs)]
+    drawings += [km.plot.run(runs["0.9"]), km.plot.runs({"": runs})]
     assert [find_hidden(drawing) for drawing in drawings] == [[]] * len(drawings)
 
 

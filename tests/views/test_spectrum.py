@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from tests.views.models import episodes, turning
-
-VALUES = np.array([1.2, -0.9, 0.5, 0.1])
-
-
-def diagonal() -> km.LinearPredictor:
-    return km.LinearPredictor(np.diag(VALUES), np.zeros((4, 0)), np.eye(4), km.State(), 0.1, list("abcd"), [])
+from tests.views.models import BILINEAR, VALUES, diagonal, episodes, turning
 
 
 def _named(axes, gid: str):
@@ -56,10 +50,8 @@ def test_eigenvalues_that_crowd_are_drawn_closer() -> None:
 
 
 def test_a_bilinear_predictor_has_a_spectrum_too() -> None:
-    model = km.BilinearPredictor(
-        np.eye(2) / 2, np.ones((2, 1)), np.zeros((1, 2, 2)), np.eye(2), km.State(), 0.1, ("a", "b"), ("u",)
-    )
-    assert _named(km.plot.spectrum(model).axes[0], "eigenvalues").get_xdata() == pytest.approx([0.5, 0.5])
+    drawn = _named(km.plot.spectrum(BILINEAR).axes[0], "eigenvalues").get_xdata()
+    assert drawn == pytest.approx(turning().eigenvalues.real)
 
 
 def test_residuals_of_the_trust_report_are_taken_with_their_tolerance() -> None:

@@ -10,7 +10,6 @@ import pytest
 from PIL import Image
 
 import koopmpc as km
-from koopmpc.views.figures.style import limit_axis
 from tests.views.models import episodes, turning
 
 
@@ -52,17 +51,6 @@ def test_a_users_settings_change_nothing_and_come_back(tmp_path: Path) -> None:
 def test_figures_are_as_wide_as_columns(width, inches: float) -> None:
     made = km.plot.rollout(turning(), episodes(1)[0], width=width)
     assert made.get_size_inches()[0] == pytest.approx(inches)
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_an_axis_shows_its_main_curve_and_others_as_far_as_they_are_near(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    (low, high), others, beyond = np.sort(rng.normal(size=2)), rng.normal(0, 4, 2), rng.uniform(0, 3)
-    span = high - low
-    bottom, top = limit_axis(low, high, others.min(), others.max(), beyond)
-    shown = [low, high, *np.clip(others, low - beyond * span, high + beyond * span)]
-    margin = 0.06 * np.ptp(shown)
-    assert (bottom, top) == pytest.approx((min(shown) - margin, max(shown) + margin))
 
 
 def test_curves_differ_in_more_than_colour() -> None:

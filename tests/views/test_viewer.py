@@ -1,7 +1,5 @@
 """The viewer is found or opened, never waited for in vain, and it draws what a log tells it to."""
 
-import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -9,11 +7,9 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import koopmpc as km
 from koopmpc.apps.bench.problem_files import shipped
-from koopmpc.apps.cli.app import app
 from koopmpc.views.recording import viewer
 from koopmpc.views.recording.viewer import find_viewer, free_port, has_display, is_up, start_viewer
 from tests.views.runs import about, make_run, steps_of
@@ -47,36 +43,11 @@ def test_several_logs_open_in_one_viewer(log: Path, monkeypatch: pytest.MonkeyPa
     assert opened == [[str(log), str(log)], [str(log)]]
 
 
-def test_a_server_that_does_not_end_when_asked_is_killed(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stubborn = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(600)"
-    server = subprocess.Popen([sys.executable, "-S", "-c", stubborn], stdout=subprocess.PIPE)
-    assert server.stdout is not None
-    server.stdout.readline()  # from here on it ignores the signal
-    monkeypatch.setattr(viewer, "start_viewer", lambda *arguments, port: server)
-    monkeypatch.setattr(viewer, "_comes_up", lambda server, port: True)
-    monkeypatch.setattr(viewer, "_END", 0.1)
-    with viewer.serve(log, free_port()):
-        assert server.poll() is None
-    assert server.returncode == -signal.SIGKILL
-    server.stdout.close()
-
-
 def test_without_a_display_the_command_for_another_machine_is_told(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(viewer, "has_display", lambda: False)
     told = r"there is no display to open .*run\.rrd on; `koopmpc view --web .*`.*, or copy it to a machine with .* run `koopmpc view run\.rrd`"
     with pytest.raises(km.errors.LogError, match=told):
         km.recording.view(log)
-
-
-def test_without_a_display_a_comparison_is_told_by_the_logs_that_it_compares(
-    log: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(viewer, "has_display", lambda: False)
-    shown = CliRunner().invoke(app, ["view", "--compare", str(log), str(log)])
-    assert shown.exit_code == 2
-    told = " ".join(shown.output.split())
-    assert f"`koopmpc view --compare --web {log} {log}` serves them" in told
-    assert "run `koopmpc view --compare run.rrd run.rrd` there" in told
 
 
 def test_a_viewer_that_does_not_start_is_told(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,8 +21,8 @@ from koopmpc.synthesis.doubts import describe_rest
 from koopmpc.synthesis.loops.judging import Fenced, read_reference, run_on_surrogate
 from koopmpc.synthesis.loops.neighbours import choose_starts_to_record, probe_range
 from koopmpc.validate.logs.summary import LogExcerpt, LogSummary
-from koopmpc.views.figures.blind_regions import draw_blindness
 from koopmpc.views.figures.evidence import draw_forecast, draw_log, draw_loops
+from koopmpc.views.figures.regions import draw_blindness
 from koopmpc.views.figures.style import render_svg
 
 LOOPS = 3  # loops of a kind that a report draws

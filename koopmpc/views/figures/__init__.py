@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from koopmpc.base.lazy import attach
 
 if TYPE_CHECKING:
-    from koopmpc.views.figures.blind_regions import blindness as blindness
     from koopmpc.views.figures.eigenvalues import eigenfunction_maps as eigenfunction_maps
     from koopmpc.views.figures.eigenvalues import spectrum as spectrum
+    from koopmpc.views.figures.regions import blindness as blindness
     from koopmpc.views.figures.regions import certificate as certificate
     from koopmpc.views.figures.series import error as error
     from koopmpc.views.figures.series import reconstruction as reconstruction

@@ -10,21 +10,18 @@ from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
-from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.errors import DataError
 from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episodes
-from koopmpc.lifting.base import find_state
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.validate.residuals import ResidualDMD, check_residuals
 from koopmpc.validate.scoring import AnyPredictor
-from koopmpc.views.figures.style import CYCLIC, SEQUENTIAL, Width, make_figure, styled
+from koopmpc.views.figures.style import CYCLIC, SEQUENTIAL, Width, find_plane, make_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_BLOCK_ROWS = 4096  # states that are lifted in one block
 _CUT = 0.8 * np.pi  # [rad] lines of equal phase end here, because the phase jumps at ±π
-_EDGE = 0.08  # keep labels away from each side by this share of the width, so that they are not cut
 _LABEL_BOX: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 0.8}
 _QUARTERS = {-np.pi / 2: "−π/2", 0.0: "0", np.pi / 2: "π/2"}
 Axes = tuple[int | str, int | str]
@@ -177,12 +174,7 @@ def make_plane(states: Sequence[str], axes: Axes, over: Over, at: ArrayLike | No
     DataError
         There is no such state, both axes are the same state, or a range is empty.
     """
-    checks.kind(axes, "plane", (tuple, list), "pass the two states that span it, by index or name")
-    if len(axes) != 2:
-        raise ShapeError(f"plane names {len(axes)} states; pass the two that span it")
-    first, second = (find_state(state, states, "the plane") for state in axes)
-    if first == second:
-        raise DataError(f"both axes of the plane are {states[first]}; name two different states")
+    first, second = find_plane(axes, states, "the plane")
     if isinstance(over, Episodes):
         X = np.concatenate([episode.X for episode in over])
         ranges = np.column_stack([X.min(axis=0), X.max(axis=0)])[[first, second]]
@@ -221,7 +213,8 @@ def evaluate_eigenfunctions(
     if not chosen:
         raise DataError("which is empty; pass the index of an eigenfunction, or several")
     left, X = predictor.left_eigenvectors[chosen].T, plane.points
-    parts = [predictor.lift(X[i : i + _BLOCK_ROWS]) @ left for i in range(0, len(X), _BLOCK_ROWS)]
+    rows = 4096  # states that are lifted in one block
+    parts = [predictor.lift(X[i : i + rows]) @ left for i in range(0, len(X), rows)]
     phi = np.concatenate(parts).T.reshape(len(chosen), len(plane.up), len(plane.across))
     largest = np.abs(phi).max(axis=(1, 2))
     if (largest == 0).any():
@@ -339,7 +332,7 @@ def _draw_phase(drawing: Any, axes: Any, plane: Plane, phase: np.ndarray, label:
         lines = axes.contour(plane.across, plane.up, inner, **look)
         halo = withStroke(linewidth=2.0, foreground="white")  # the darkest colour is as dark as the line
         lines.set_path_effects([halo])
-        across = np.quantile(plane.across, [_EDGE, 1 - _EDGE])
+        across = np.quantile(plane.across, [0.08, 0.92])  # labels beyond would be cut
         texts: Any = axes.clabel(lines, fontsize=6, fmt=_QUARTERS, inline=False)
         for text in texts:
             text.set(x=np.clip(text.get_position()[0], *across), bbox=_LABEL_BOX)

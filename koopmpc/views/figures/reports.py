@@ -17,9 +17,6 @@ from koopmpc.views.figures.style import REFERENCE, draw_legend, fit_label, label
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MOST_RATIO = 10.0  # a performance profile ends at this ratio of costs
-_ROW_PANELS = 3  # number of regions of attraction in a row
-
 
 @dataclass(frozen=True)
 class CurvePanel:
@@ -107,11 +104,12 @@ def draw_profiles(ratios: Mapping[str, np.ndarray]) -> "Figure":
     """Draw the share of runs whose cost is at most τ times the best cost; a run that fails has the ratio inf."""
     drawing, axes = make_figure(1, width="two columns", height=2.8)
     panel = axes[0, 0]
-    grid = np.geomspace(1.0, _MOST_RATIO, 400)
+    most = 10.0  # ratio of costs
+    grid = np.geomspace(1.0, most, 400)
     for i, (name, values) in enumerate(ratios.items()):
         share = np.searchsorted(np.sort(values), grid, side="right") / max(len(values), 1)
         panel.plot(grid, share, label=name, **line_style(i, len(grid)))
-    panel.set(xscale="log", xlim=(1.0, _MOST_RATIO), ylim=(-0.02, 1.02))
+    panel.set(xscale="log", xlim=(1.0, most), ylim=(-0.02, 1.02))
     panel.set(xlabel="τ: cost over the best controller's of the same start", ylabel="share of runs within τ")
     panel.set_xticks([1, 1.5, 2, 3, 5, 10], ["1", "1.5", "2", "3", "5", "10"], minor=False)
     panel.minorticks_off()
@@ -144,10 +142,9 @@ def draw_step_times(hot: Mapping[str, np.ndarray], cold: Mapping[str, np.ndarray
 @styled
 def draw_attraction(starts_by_name: Mapping[str, tuple[np.ndarray, np.ndarray]], names: Sequence[str]) -> "Figure":
     """Draw initial states in a panel for each controller: circles reach their reference, crosses do not."""
-    rows = -(-len(starts_by_name) // _ROW_PANELS)
-    drawing, axes = make_figure(
-        rows, _ROW_PANELS, width="two columns", height=2.1 * rows + 0.3, sharex=True, sharey=True
-    )
+    columns = 3
+    rows = -(-len(starts_by_name) // columns)
+    drawing, axes = make_figure(rows, columns, width="two columns", height=2.1 * rows + 0.3, sharex=True, sharey=True)
     for panel, (name, (starts, reached)) in zip(axes.ravel(), starts_by_name.items(), strict=False):
         size = 14.0 if len(starts) < 200 else 4.0
         panel.scatter(*starts[reached].T, s=size, marker="o", color="#0072b2", linewidths=0.0, label="reaches")

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from koopmpc.base import checks, disk
-from koopmpc.base.errors import DataError
-from koopmpc.lifting.base import StateChoice, find_states
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.lifting.base import StateChoice, find_state, find_states
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -203,6 +203,28 @@ def choose_states(states: StateChoice | None, names: Sequence[str]) -> list[int]
     if not 1 <= len(chosen) <= _MOST_STATES:
         raise DataError(f"the figure is asked for {len(chosen)} states; choose 1 to {_MOST_STATES} with states=…")
     return chosen
+
+
+def find_plane(axes: Sequence[int | str], names: Sequence[str], what: str) -> tuple[int, int]:
+    """Return the indices of the two states of a plane; raise if they are not two."""
+    checks.kind(axes, "axes", (tuple, list), "pass the two states of the plane, by index or name")
+    if len(axes) != 2:
+        raise ShapeError(f"axes names {len(axes)} states; pass the two of the plane")
+    i, j = (find_state(axis, names, what) for axis in axes)
+    if i == j:
+        raise DataError(f"both axes are {names[i]!r}; name two different states")
+    return i, j
+
+
+def draw_points(panel: "Axes", points: Float[np.ndarray, "n 2"], most: int) -> None:
+    """Draw states of the data, at most about so many, below all curves."""
+    panel.plot(*points[:: max(1, len(points) // most)].T, ".", color="#9a9a9a", markersize=1.2, zorder=0, label="data")
+
+
+def draw_box(panel: "Axes", low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"], label: str) -> None:
+    """Draw the edges of a box in the style of limits."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
+    panel.plot(*(low + corners * (high - low)).T, **LIMIT, label=label)
 
 
 @styled

@@ -8,27 +8,15 @@ from typing import Any
 import numpy as np
 
 from koopmpc.base.errors import KoopmpcError, LogError
-from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.text import format_markdown_table
 from koopmpc.loop.metrics import metrics, running_cost
 from koopmpc.loop.run import Run
-from koopmpc.views.recording.blueprint import (
-    LIMIT,
-    REFERENCE,
-    color,
-    draw_line,
-    frame_views,
-    limit_lines,
-    readable,
-    shared_time,
-    write_page,
-)
-from koopmpc.views.recording.description import drawable, table_figures, title_of
+from koopmpc.views.recording.blueprint import find_limits, limit_rows
+from koopmpc.views.recording.description import table_figures, title_of
+from koopmpc.views.recording.plots import INK, Plot, Series, color, readable, record_plots, shared_time
 from koopmpc.views.recording.reader import load_run
-from koopmpc.views.recording.rrd import file_recording
 
 
-@raise_swallowed()  # Python drops a Ctrl-C that comes while a recording is deleted
 def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
     """Write the runs of several logs as one .rrd, with a colour each run in every plot.
 
@@ -57,29 +45,33 @@ def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
     inputs = _in_order([run.inputs for run in runs])
     if max(sum(name in (*run.states, *run.inputs) for run in runs) for name in (*states, *inputs)) < 2:
         raise LogError(f"the runs of {', '.join(map(str, logs))} have no state and no input in common")
+    drawn = [(f"state/{i}", name, _curves(runs, name, "states", "X")) for i, name in enumerate(states)]
+    drawn += [(f"input/{j}", name, _curves(runs, name, "inputs", "U")) for j, name in enumerate(inputs)]
+    drawn = drawn[:8]  # plots of states and inputs in one column
     costs = [_cost(run) for run in runs]
-    plots = [(f"state/{i}", name, _curves(runs, name, "states", "X")) for i, name in enumerate(states)]
-    plots += [(f"input/{j}", name, _curves(runs, name, "inputs", "U")) for j, name in enumerate(inputs)]
-    plots = plots[:8]  # plots of states and inputs in one column
-    plots += [("cost", "Cost so far", costs)] if any(values is not None for values in costs) else []
-    longest = max(run.steps * run.dt for run in runs)
+    drawn += [("cost", "Cost so far", costs)] if any(values is not None for values in costs) else []
+    plots: list[Plot] = []
+    for entity, title, curves in drawn:
+        series = [
+            Series(f"{entity}/{r + 1}", [(names[r], color(r), 2.0, values)], run.dt, held=entity.startswith("input"))
+            for r, (run, values) in enumerate(zip(runs, curves, strict=True))
+            if values is not None
+        ]
+        series += [
+            Series(f"{entity}/mark/{r}", [(name, shade, 1.0, values)], dt)
+            for r, (name, shade, values, dt) in enumerate(_marks(runs, title))
+        ]
+        plots.append(Plot(entity, title, series, legend=not plots))
+    time = shared_time(max(run.steps * run.dt for run in runs))
+    ends = [[c[np.isfinite(c)] for c in curves if c is not None] for *_, curves in drawn]
+    axes = [readable(np.concatenate(values).tolist(), 8.0) for values in ends]
     layout = rrb.Horizontal(
-        rrb.Vertical(
-            *(_view(entity, title, curves, i == 0, longest) for i, (entity, title, curves) in enumerate(plots))
-        ),
+        rrb.Vertical(*(plot.view(axis_x=time, axis_y=axis) for plot, axis in zip(plots, axes, strict=True))),
         rrb.TextDocumentView(origin="metrics", name="Metrics"),
         column_shares=[1.5, 1.0],  # the table names figures and holds a column a run,
     )
-    with file_recording(path, "koopmpc-comparison", frame_views(layout)) as rec:
-        rec.send_recording_name(drawable(" against ".join(names)))
-        for entity, title, curves in plots:
-            for r, (run, values) in enumerate(zip(runs, curves, strict=True)):
-                if values is not None:
-                    held = {"interpolation_mode": "StepAfter"} if entity.startswith("input") else {}
-                    draw_line(rec, f"{entity}/{r + 1}", names[r], color(r), 2.0, values, run.dt, **held)
-            for r, (name, shade, values, dt) in enumerate(_marks(runs, title)):
-                draw_line(rec, f"{entity}/mark/{r}", name, shade, 1.0, values, dt)
-        write_page(rec, "metrics", f"{heading}{_table(runs, names)}")
+    metrics = f"{heading}{_table(runs, names)}"
+    record_plots(path, "koopmpc-comparison", " against ".join(names), plots, layout, metrics=metrics)
 
 
 def _names(runs: Sequence[Run], paths: Sequence[Path]) -> tuple[list[str], str]:
@@ -127,29 +119,17 @@ def _marks(runs: Sequence[Run], title: str) -> list[tuple[str, Any, np.ndarray, 
         if title in tracked:
             values = run.reference[:, tracked.index(title)]
             key = b"r" + (values[:1] if np.ptp(values) == 0 else values).tobytes()
-            found.setdefault(key, ("reference", REFERENCE, values, run.dt))
+            found.setdefault(key, ("reference", INK.reference, values, run.dt))
         for kind in ("states", "inputs"):
-            lines = limit_lines(run, kind, [title], np.arange(run.steps + (kind == "states")))
+            limits = [limit for limit in find_limits(run, kind) if limit.name == title]
+            lines = limit_rows(run, kind, limits, np.arange(run.steps + (kind == "states")))
             for values in lines.T:
                 if np.ptp(values) == 0:
-                    line = ("limits", LIMIT, np.full(2, values[0]), run.steps * run.dt)
+                    line = ("limits", INK.limit, np.full(2, values[0]), run.steps * run.dt)
                     found.setdefault(b"l" + values[:1].tobytes(), line)
                 else:
-                    found.setdefault(b"l" + values.tobytes(), ("limits", LIMIT, values, run.dt))
+                    found.setdefault(b"l" + values.tobytes(), ("limits", INK.limit, values, run.dt))
     return list(found.values())
-
-
-def _view(entity: str, title: str, curves: Sequence[np.ndarray | None], first: bool, length: float) -> Any:
-    import rerun.blueprint as rrb
-
-    values = np.concatenate([c[np.isfinite(c)] for c in curves if c is not None])
-    return rrb.TimeSeriesView(
-        origin=entity,
-        name=drawable(title),
-        axis_x=shared_time(length),
-        axis_y=readable(values.tolist(), 8.0),
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=first),
-    )
 
 
 def _table(runs: Sequence[Run], names: Sequence[str]) -> str:

@@ -4,24 +4,24 @@ import dataclasses
 import json
 import re
 import unicodedata
-from collections.abc import Iterable, Mapping
-from enum import Enum, StrEnum
+from collections.abc import Mapping
+from enum import StrEnum
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from koopmpc.base import checks
 from koopmpc.base.errors import LogError
 from koopmpc.base.text import format_markdown_table
-from koopmpc.base.values import checksum, from_data, to_data
+from koopmpc.base.values import from_data, to_data
 from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.move import Fallback, Status
 from koopmpc.lifting.base import Lifting
 from koopmpc.loop.metrics import Metrics
-from koopmpc.loop.rows import StepRows
+from koopmpc.loop.rows import MOVE_COLUMNS, StepRows
 from koopmpc.loop.run import About, bind_outputs
 
 _FORMAT = "koopmpc-log-2"
@@ -33,7 +33,8 @@ class Entity(StrEnum):
     An entity holds rows of numbers in its component "scalars", row k at step k; other components are named beside it.
     What only the viewer draws is not in it: `world`, `model`, `plots`, `title`, and components `koopmpc.View:…`:
     one state alone in single precision, the power of ten of a time. `MOVE_COLUMNS` names further columns: numbers in
-    the rows where they differ from the column's absent value, words in "state" in the rows where they change.
+    the rows where they differ from the column's absent value, words in "state" in the rows where they change. The last
+    row of a log is `checksum`, of all its bytes.
     """
 
     DESCRIPTION = "description"  # static: the page that people read, and "json", the same data to the bit
@@ -49,11 +50,48 @@ class Entity(StrEnum):
     PLAN_STATES = "prediction/x"  # the planned states of a step, flat; "last_width" is nx
     PLAN_INPUTS = "prediction/u"  # the planned inputs of a step, flat; "last_width" is nu
     FALLBACKS = "log"  # text: a line where a fallback sets in
-    METRICS = "metrics"  # static, at the end: a page, "steps", "cost", "effort", "violation", "digest", "check"
+    METRICS = "metrics"  # static, at the end: a page, "steps", "cost", "effort", "violation"
 
 
 DRAWN = (Entity.INPUT_LIMITS, Entity.DEADLINE, Entity.FALLBACKS)  # for people who look; `load_run` needs all others
+READ = tuple(entity for entity in Entity if entity not in DRAWN)
 NO_WORD = "none"  # word of a step without one, such as the solver of a step that asked none; also before all rows
+
+
+# entity -> the column of words that it keeps
+WORDS = {column.log: column.name for column in MOVE_COLUMNS if column.log and column.dtype is None}
+
+
+class Sparse(NamedTuple):
+    """Where a log keeps a column of numbers, in the rows where it is not, to the bit, the `absent` value."""
+
+    entity: str
+    component: str
+    absent: np.ndarray
+
+
+def sparse_columns(X: np.ndarray, ms: np.ndarray, ny: int, nu: int) -> dict[str, Sparse]:
+    """Return how the columns of `StepRows` are kept that follow, as a rule, from the states and the solve times."""
+    measured = X if X.shape[1] == ny else np.full((len(X), ny), np.nan)
+    found = {
+        "Y": Sparse(Entity.MEASUREMENT, "scalars", measured),
+        "u_reference": Sparse(Entity.INPUT_REFERENCE, "scalars", np.zeros((len(ms), nu))),
+        "solve_time": Sparse(Entity.SOLVER, "seconds", ms / 1e3),
+        "iterations": Sparse(Entity.SOLVER, "iterations", np.zeros(len(ms), dtype=np.int64)),
+    }
+    for column in MOVE_COLUMNS:
+        if column.log and column.dtype is not None:
+            found[column.name] = Sparse(column.log, "scalars", np.full(len(ms), column.absent, dtype=column.dtype))
+    return found
+
+
+def word_columns(rows: StepRows) -> dict[str, list[str]]:
+    """Return the words of each row by entity; a log keeps them where they change."""
+    words: dict[str, list[str]] = {
+        entity: [word or NO_WORD for word in getattr(rows, name)] for entity, name in WORDS.items()
+    }
+    words[Entity.STATUS] = [status_value(*pair) for pair in zip(rows.status, rows.fallback, strict=True)]
+    return words
 
 
 def application_of(about: About) -> str:
@@ -99,6 +137,11 @@ def status_words(status: Status, fallback: Fallback) -> str:
     return word if fallback is Fallback.NONE else f"{word}, then {fallback.name.lower().replace('_', ' ')}"
 
 
+def status_value(status: Status, fallback: Fallback) -> str:
+    """Return "STATUS" or "STATUS → FALLBACK", as the log holds it."""
+    return status.name if fallback is Fallback.NONE else f"{status.name} → {fallback.name}"
+
+
 def to_json(about: About, steps: int | None) -> str:
     """Return `about` as JSON, exact to the bit; `steps` where the length is known beforehand."""
     tree = {"format": _FORMAT, "steps": steps, "written_with": written_with(), "about": to_data(about)}
@@ -123,28 +166,6 @@ def from_json(text: str) -> tuple[About, int | None]:
     if not isinstance(about, About):
         raise LogError(f"the description holds {checks.article(about)} in place of the description of a run")
     return about, steps
-
-
-def sum_plans(steps: Iterable[int], X: np.ndarray, U: np.ndarray) -> dict[int, int]:
-    """Return a checksum of each plan by its step; a plan without a number has none."""
-    sums: dict[int, int] = {}
-    for i, k in enumerate(steps):
-        if not (np.isnan(X[i]).all() and np.isnan(U[i]).all()):
-            sums[k] = checksum(X[i].tobytes(), U[i].tobytes())
-    return sums
-
-
-def digest(rows: StepRows, description: str, plans: Mapping[int, int]) -> dict[str, int]:
-    """Return a checksum of everything that `load_run` returns, by name; `plans` are those of `sum_plans`."""
-    sums = {Entity.DESCRIPTION.value: checksum(description.encode())}
-    for name, values in rows.columns().items():
-        if isinstance(values, np.ndarray):
-            sums[name] = checksum(np.ascontiguousarray(cast("np.ndarray", values)).data)
-        else:
-            words: list[str] = [value.name if isinstance(value, Enum) else str(value) for value in values]
-            sums[name] = checksum("\n".join(words).encode())
-    whole = {k: value for k, value in sorted(plans.items()) if k < len(rows.U)}
-    return sums | {"plans": checksum(json.dumps(whole).encode())}
 
 
 def to_markdown(about: About) -> str:

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError, LogError
 from koopmpc.base.interrupts import raise_swallowed
-from koopmpc.base.scene import Color
 from koopmpc.base.text import format_markdown_table, shorten_observable
 from koopmpc.data.episodes import Episodes
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
@@ -24,21 +23,15 @@ from koopmpc.validate.report import TrustReport
 from koopmpc.validate.scoring import AnyPredictor, Score, score
 from koopmpc.views.figures.eigenvalues import Axes, Plane, evaluate_eigenfunctions, make_plane
 from koopmpc.views.figures.style import CYCLIC, SEQUENTIAL, map_colors
-from koopmpc.views.recording.blueprint import color, frame_views, shared_time, write_page
+from koopmpc.views.recording.blueprint import draw_eigenvalues, eigenvalue_views, plane_view
 from koopmpc.views.recording.description import Entity, drawable, written_with
-from koopmpc.views.recording.eigenvalues import draw_eigenvalues, eigenvalue_views, plane_view
-from koopmpc.views.recording.reader import naming, read_columns
-from koopmpc.views.recording.rrd import CHECK, file_recording, times
+from koopmpc.views.recording.plots import INK, Curve, Plot, Series, color, frame_views, shared_time
+from koopmpc.views.recording.rrd import LogColumns, RerunLog
 
-_TRUTH: Color = (225, 228, 232)
 _PREDICTED = color(0)
-_BAND: Color = (70, 125, 185)
 _STYLE_SIGNS = re.compile(r"([*_`])")  # Markdown would read these signs as style: each gets a backslash
-_SHOWN = 6  # plots of states in one column
 _FORMAT = "koopmpc-model-1"
-_INK: Color = (250, 250, 250)  # of the words around a picture
 
-Curve = tuple[str, Color, float, np.ndarray]  # name, colour, width [points], one value a step
 Picture = tuple[str, str, dict[str, Any]]  # entity, title, archetypes by entity
 
 
@@ -99,58 +92,54 @@ def record_model(
     ahead = [forecast(predictor, episode, horizon, bands=bands, relift=relift) for episode in list(episodes)[:count]]
     residuals = None if report is None else report.residuals
     pictures, surface, note = _pictures(predictor, episodes, report, which, plane, at)
-    layout = _blueprint(predictor, ahead, pictures, surface, told=residuals is not None)
-    with file_recording(path, "koopmpc-model", layout) as rec:
-        rec.send_recording_name(drawable(f"model of {', '.join(predictor.states)}"))
-        write_page(rec, "report", _page(predictor, report, note))
-        facts = _facts(predictor) | {"horizon": horizon, "band": ahead[0].band if ahead else ""}
-        about = {"format": _FORMAT, "written_with": written_with(), "dt": predictor.dt, "facts": facts}
-        about |= {"states": list(predictor.states), "forecasts": len(ahead)}
-        rec.log(Entity.DESCRIPTION, rr.AnyValues(json=json.dumps(about, ensure_ascii=False)), static=True)
-        drawn = draw_eigenvalues(predictor, residuals)
+    tabs = {
+        f"Forecast of episode {r}": _plot_forecast(predictor, one, f"rollout/{r}") for r, one in enumerate(ahead)
+    } | {"Error by time ahead": _plot_errors(errors, predictor)}
+    facts = _facts(predictor) | {"horizon": horizon, "band": ahead[0].band if ahead else ""}
+    about = {"format": _FORMAT, "written_with": written_with(), "dt": predictor.dt, "facts": facts}
+    about |= {"states": list(predictor.states), "forecasts": len(ahead)}
+    drawn = draw_eigenvalues(predictor, residuals)
+    with RerunLog("koopmpc-model", path=path) as log:
+        log.lay_out(_lay_out(predictor, horizon, tabs, pictures, surface, told=residuals is not None))
+        log.rec.send_recording_name(drawable(f"model of {', '.join(predictor.states)}"))
+        log.page("report", _page(predictor, report, note))
+        log.style(Entity.DESCRIPTION, rr.AnyValues(json=json.dumps(about, ensure_ascii=False)))
         for entity, archetype in [*drawn.items(), *(pair for *_, parts in pictures for pair in parts.items())]:
-            rec.log(entity, archetype, static=True)
-        for r, one in enumerate(ahead):
-            for i in range(predictor.nx):
-                _send(rec, f"rollout/{r}/state/{i}", _forecast_curves(one, i), predictor.dt)
-            if predictor.nu:
-                inputs = [(name, color(1 + j), 2.0, one.U[:, j]) for j, name in enumerate(one.inputs)]
-                _send(rec, f"rollout/{r}/inputs", inputs, predictor.dt, interpolation_mode="StepAfter")
-        for i in range(predictor.nx):
-            _send(rec, f"error/{i}", _error_curves(errors, i), predictor.dt, first=1)
+            log.style(entity, archetype)
+        for series in (series for plots in tabs.values() for plot in plots for series in plot.series):
+            series.write(log)
 
 
-def _forecast_curves(ahead: Forecast, i: int) -> list[Curve]:
-    """Return truth, prediction and, where it is finite, the band of the i-th state."""
-    curves: list[Curve] = [("prediction", _PREDICTED, 3.0, ahead.predicted[:, i])]
-    known = np.isfinite(ahead.predicted[:, i])
-    if ahead.band and np.isfinite(ahead.low[known, i]).all() and np.isfinite(ahead.high[known, i]).all():
-        curves += [
-            (f"{ahead.band}, low", _BAND, 1.0, ahead.low[:, i]),
-            (f"{ahead.band}, high", _BAND, 1.0, ahead.high[:, i]),
+def _plot_forecast(predictor: AnyPredictor, ahead: Forecast, entity: str) -> list[Plot]:
+    """Return a plot a state of truth, prediction and, where it is finite, the band; and one of all inputs."""
+    plots: list[Plot] = []
+    for i, name in enumerate(predictor.states):
+        curves: list[Curve] = [("prediction", _PREDICTED, 3.0, ahead.predicted[:, i])]
+        known, band = np.isfinite(ahead.predicted[:, i]), {"low": ahead.low[:, i], "high": ahead.high[:, i]}
+        if ahead.band and all(np.isfinite(values[known]).all() for values in band.values()):
+            curves += [(f"{ahead.band}, {end}", INK.band, 1.0, values) for end, values in band.items()]
+        curves.append(("truth", INK.truth, 1.2, ahead.truth[:, i]))  # thin, and over the prediction
+        at = f"{entity}/state/{i}"
+        plots.append(Plot(at, name, [Series(at, curves, predictor.dt)], legend=i == 0))
+    if predictor.nu:
+        curves = [(name, color(1 + j), 2.0, ahead.U[:, j]) for j, name in enumerate(ahead.inputs)]
+        series = Series(f"{entity}/inputs", curves, predictor.dt, held=True)
+        plots.append(Plot(series.entity, ", ".join(predictor.inputs), [series], legend=predictor.nu > 1))
+    return plots
+
+
+def _plot_errors(score: Score, predictor: AnyPredictor) -> list[Plot]:
+    """Return a plot a state of the root-mean-square error and the 5 and 95 % quantiles of the errors."""
+    plots: list[Plot] = []
+    for i, name in enumerate(predictor.states):
+        curves: list[Curve] = [
+            ("RMSE", _PREDICTED, 2.5, score.rmse[:, i]),
+            ("5 % of the errors", INK.band, 1.0, score.low[:, i]),
+            ("95 % of the errors", INK.band, 1.0, score.high[:, i]),
         ]
-    return [*curves, ("truth", _TRUTH, 1.2, ahead.truth[:, i])]  # thin, and over the prediction
-
-
-def _error_curves(score: Score, i: int) -> list[Curve]:
-    """Return the root-mean-square error of the i-th state and the 5 and 95 % quantiles of its errors."""
-    return [
-        ("RMSE", _PREDICTED, 2.5, score.rmse[:, i]),
-        ("5 % of the errors", _BAND, 1.0, score.low[:, i]),
-        ("95 % of the errors", _BAND, 1.0, score.high[:, i]),
-    ]
-
-
-def _send(rec: Any, entity: str, curves: Sequence[Curve], dt: float, *, first: int = 0, **style: Any) -> None:
-    """Write curves over the steps first, first + 1, … as one entity: their style once, and their columns."""
-    import rerun as rr
-
-    names, colors, widths, columns = (list(part) for part in zip(*curves, strict=True))
-    drawn = [drawable(name) for name in names]
-    rec.log(entity, rr.SeriesLines(names=drawn, colors=colors, widths=widths, **style), static=True)
-    values = np.column_stack(columns)
-    scalars = rr.Scalars.columns(scalars=values.ravel()).partition([len(names)] * len(values))
-    rec.send_columns(entity, times(first + np.arange(len(values)), dt), scalars)
+        series = Series(f"error/{i}", curves, predictor.dt, first=1)
+        plots.append(Plot(series.entity, f"Error of {name}, by time ahead", [series], legend=i == 0))
+    return plots
 
 
 def _pictures(
@@ -199,12 +188,6 @@ def _eigenfunctions(predictor: LinearPredictor, which: Sequence[int], plane: Pla
     return pictures
 
 
-def _picture_view(entity: str, title: str, plane: Plane) -> Any:
-    """Return the view of one picture, with room for the words around it."""
-    n, m = len(plane.across), len(plane.up)
-    return plane_view(entity, drawable(title), [-0.3 * n, 1.1 * n], [-0.08 * m, 1.25 * m])
-
-
 def _picture(entity: str, pixels: np.ndarray, plane: Plane) -> dict[str, Any]:
     """Return the picture, rows from the top down, and its axes in words."""
     import rerun as rr
@@ -222,7 +205,7 @@ def _picture(entity: str, pixels: np.ndarray, plane: Plane) -> dict[str, Any]:
     return {
         f"{entity}/picture": rr.Image(np.ascontiguousarray(pixels[::-1])),
         f"{entity}/axes": rr.Points2D(
-            list(words), labels=list(words.values()), radii=0.0, colors=_INK, show_labels=True, draw_order=40
+            list(words), labels=list(words.values()), radii=0.0, colors=INK.prediction, show_labels=True, draw_order=40
         ),
     }
 
@@ -274,40 +257,39 @@ def _facts(predictor: AnyPredictor) -> dict[str, str]:
     return rows
 
 
-def _blueprint(
+def _lay_out(
     predictor: AnyPredictor,
-    ahead: Sequence[Forecast],
+    horizon: int,
+    tabs: Mapping[str, Sequence[Plot]],
     pictures: Sequence[Picture],
     surface: Plane | None,
     *,
     told: bool,
 ) -> Any:
+    """Return the layout: a tab for each group of plots, of the first few states; eigenvalues, pictures and the page."""
     import rerun.blueprint as rrb
 
-    def plot(origin: str, name: str, *, legend: bool) -> Any:
-        corner = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
-        return rrb.TimeSeriesView(origin=origin, name=drawable(name), axis_x=shared_time(length), plot_legend=corner)
-
-    length = max((len(one.truth) for one in ahead), default=1) * predictor.dt
-    states = list(enumerate(predictor.states))[:_SHOWN]
-    tabs = []
-    for r in range(len(ahead)):
-        plots = [plot(f"rollout/{r}/state/{i}", name, legend=i == 0) for i, name in states]
-        if predictor.nu:
-            plots.append(plot(f"rollout/{r}/inputs", ", ".join(predictor.inputs), legend=predictor.nu > 1))
-        tabs.append(rrb.Vertical(*plots, name=f"Forecast of episode {r}"))
-    errors = [plot(f"error/{i}", f"Error of {name}, by time ahead", legend=i == 0) for i, name in states]
-    left = rrb.Tabs(*tabs, rrb.Vertical(*errors, name="Error by time ahead"))
-    text = rrb.TextDocumentView(origin="report", name="Report")
-    rows: list[Any] = [rrb.Horizontal(*eigenvalue_views(predictor, residuals=told))]
-    if surface is not None:
-        views = [_picture_view(entity, title, surface) for entity, title, _ in pictures]
-        rows.append(rrb.Grid(*views, grid_columns=min(len(views), 2)))
-    return frame_views(
-        rrb.Horizontal(
-            left, rrb.Vertical(*rows, text, row_shares=[*[3.0, 4.0][: len(rows)], 3.0]), column_shares=[1.0, 1.2]
+    time = shared_time((horizon + 1) * predictor.dt)
+    left = rrb.Tabs(
+        *(
+            rrb.Vertical(*(plot.view("LeftTop", axis_x=time) for plot in _choose_plots(plots)), name=name)
+            for name, plots in tabs.items()
         )
     )
+    rows: list[Any] = [rrb.Horizontal(*eigenvalue_views(predictor, residuals=told))]
+    if surface is not None:
+        n, m = len(surface.across), len(surface.up)
+        room = [-0.3 * n, 1.1 * n], [-0.08 * m, 1.25 * m]  # for the words around a picture
+        views = [plane_view(entity, drawable(title), *room) for entity, title, _ in pictures]
+        rows.append(rrb.Grid(*views, grid_columns=min(len(views), 2)))
+    text = rrb.TextDocumentView(origin="report", name="Report")
+    right = rrb.Vertical(*rows, text, row_shares=[*[3.0, 4.0][: len(rows)], 3.0])
+    return frame_views(rrb.Horizontal(left, right, column_shares=[1.0, 1.2]))
+
+
+def _choose_plots(plots: Sequence[Plot], most: int = 6) -> list[Plot]:
+    """Return the plots of the first states, at most so many, and that of the inputs."""
+    return [plot for i, plot in enumerate(plots) if i < most or plot.entity.endswith("inputs")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,12 +320,9 @@ def load_model_log(path: str | Path) -> ModelLog:
     UserWarning
         The end of the file is cut.
     """
-    path = Path(path)
-    log = read_columns(path, (f"/{Entity.DESCRIPTION}", "/error/**", "/rollout/**", "/checksum"))
-    with naming(path):
-        if log.static("checksum", "check") not in (None, CHECK) and not log.intact:
-            raise LogError(f"{path} is damaged: it no longer holds what was written; take another copy")
-        if log.torn:
+    log = LogColumns(Path(path), Entity.DESCRIPTION, "error/**", "rollout/**")
+    with log.reading():
+        if not log.closed:
             warnings.warn(f"{path}: its end is cut; take another copy, curves may lack rows", UserWarning, stacklevel=2)
         text = log.static(Entity.DESCRIPTION, "json")
         about: dict[str, Any] = {} if text is None else json.loads(text)

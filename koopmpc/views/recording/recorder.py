@@ -1,10 +1,10 @@
 """A Recorder writes a log step by step while the loop runs: the log that `record` writes of the whole run."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from threading import Event, Thread
 from types import TracebackType
 from typing import Any, cast
@@ -21,9 +21,8 @@ from koopmpc.control.move import Plan
 from koopmpc.loop.rows import Step, StepRows
 from koopmpc.loop.run import About, Run
 from koopmpc.models.base import Predictor
-from koopmpc.views.recording.blocks import block_of_steps
 from koopmpc.views.recording.viewer import PORT, find_viewer, is_up, quiet, why_none
-from koopmpc.views.recording.writer import Writer
+from koopmpc.views.recording.writer import LogBlock, Writer
 
 
 class BackgroundWriter:
@@ -31,7 +30,7 @@ class BackgroundWriter:
 
     def __init__(self, about: About, writer: Writer) -> None:
         self.queue: SimpleQueue[Step] = SimpleQueue()
-        self.put = self.queue.put
+        self.put: Callable[[Step], None] = self.queue.put
         self._about = about
         self._closing = Event()
         self._failure: Exception | None = None
@@ -51,36 +50,28 @@ class BackgroundWriter:
         written: list[StepRows] = []  # for the metrics at the end
         last: list[Step] = []  # held back, because the state after the last step is written with that step
         closing = False
-        while not closing:
-            # time between two batches [s]
-            closing = self._closing.wait(0.2)  # the thread looks at the queue five times a second
-            steps = last + self._drain()
-            if self._failure is not None:
-                continue
-            try:
-                ready, last = (steps, []) if closing else (steps[:-1], steps[-1:])
-                if ready:
-                    rows = block_of_steps(ready, len(self._about.states), end=closing)
-                    written.append(StepRows(**rows.columns()))
-                    writer.write(rows)
-                    writer.flush()
-                if closing:
-                    whole = sum(len(part.X) for part in written) > 1
-                    columns = StepRows.join(written).columns() if whole else {}
-                    writer.end(Run(**columns, **self._about.about()) if whole else None)
-            except Exception as error:  # whatever a scene, a disk or a viewer raises must not reach the loop
-                self._failure = error
-        if self._failure is not None:
-            writer.discard()
+        try:
+            with writer:
+                while not closing:
+                    # time between two batches [s]
+                    closing = self._closing.wait(0.2)  # the thread looks at the queue five times a second
+                    steps = last + self._drain()
+                    ready, last = (steps, []) if closing else (steps[:-1], steps[-1:])
+                    if ready:
+                        rows = LogBlock.of_steps(ready, len(self._about.states), end=closing)
+                        written.append(StepRows(**rows.columns()))
+                        writer.write(rows)
+                        writer.flush()
+                whole = sum(len(part.X) for part in written) > 1
+                columns = StepRows.join(written).columns() if whole else {}
+                writer.end(Run(**columns, **self._about.about()) if whole else None)
+        except Exception as error:  # whatever a scene, a disk or a viewer raises must not reach the loop
+            self._failure = error
+            self.put = lambda step: None
 
     def _drain(self) -> list[Step]:
         """Return the steps that are in the queue now."""
-        steps: list[Step] = []
-        while True:
-            try:
-                steps.append(self.queue.get_nowait())
-            except Empty:
-                return steps
+        return [self.queue.get_nowait() for _ in range(self.queue.qsize())]  # nobody else takes any
 
 
 _PATIENCE_FILE = 60.0  # longest wait at the end for a file [s]

@@ -2,7 +2,8 @@
 """Scenes: the shapes that scene(x, u) returns over time, as Rerun draws them."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
+from itertools import chain
 from math import isfinite
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from koopmpc.base.errors import DataError
 from koopmpc.base.scene import Box, Color, Disk, Line, Scene, Shape
 from koopmpc.loop.rows import StepRows
 from koopmpc.loop.run import About, bind_outputs
+from koopmpc.views.recording.plots import INK
 
 _STROKES = np.linspace(-1.0, 1.0, 5)  # places of the strokes that fill a box
 _FACES = (
@@ -36,7 +38,11 @@ class Drawing(NamedTuple):
     columns: Any
 
 
-def drawing_of(kind: type[Shape] | None, rows: Sequence[Sequence[tuple[Shape, Color]]], order: float) -> Drawing:
+ColoredShape = tuple[Shape, Color]
+Drawings = dict[str, Drawing]
+
+
+def drawing_of(kind: type[Shape] | None, rows: Sequence[Sequence[ColoredShape]], order: float) -> Drawing:
     """Return one entity: of any shapes in the plane (None), of one kind in space; each row holds any number of them.
 
     In the plane all are line strips with round ends: Rerun draws points as shaded balls, and a disk is a line without
@@ -119,12 +125,6 @@ def line_radius(shape: Shape) -> float:
             return min(shape.size) / 8 if len(shape.size) == 2 else 0.0
 
 
-BACKGROUND: Color = (247, 248, 250)
-_FAR = 0.25  # margin for predictions, which may diverge, as a share of the size of the drawn shapes
-_AIM: Color = (188, 193, 201)  # of the reference
-_STAGES = 4  # how many future stages of a plan are drawn
-
-
 @dataclass
 class Bounds:
     """The least box around some points in the plane or in space [m], their last coordinate up; empty at first."""
@@ -162,8 +162,9 @@ class Extent:
         if not np.isfinite(low).all():
             return None
         size = float((high - low).max())
-        low = np.minimum(low, np.maximum(self.predicted.low, low - _FAR * size)) - 0.06 * size - 1e-9
-        high = np.maximum(high, np.minimum(self.predicted.high, high + _FAR * size)) + 0.06 * size + 1e-9
+        far = 0.25 * size  # margin for predictions, which may diverge
+        low = np.minimum(low, np.maximum(self.predicted.low, low - far)) - 0.06 * size - 1e-9
+        high = np.maximum(high, np.minimum(self.predicted.high, high + far)) + 0.06 * size + 1e-9
         found = np.column_stack([low, high])
         if not self.in_space:
             found[1] = -found[1, ::-1]
@@ -179,6 +180,9 @@ class Names:
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._kinds or {})
+
+    def __len__(self) -> int:
+        return len(self._kinds or {})
 
     def kind(self, name: str) -> type[Shape] | None:
         """Return the kind of shape that a name stands for in space, None in the plane."""
@@ -201,7 +205,9 @@ class Names:
                     f"the scene of step {step} draws points with {many} coordinates, the last one of {shape.name!r}; "
                     "all points and sizes of a scene have two, (x, y), or all have three, (x, y, z)"
                 )
-            if not _is_finite(shape):
+            if not all(
+                map(isfinite, chain([line_radius(shape), np.sum(getattr(shape, "angle", 0.0))], *_places(shape)))
+            ):
                 raise DataError(
                     f"the scene of step {step} draws {shape.name!r} at NaN or inf; every x and u needs a place"
                 )
@@ -229,109 +235,12 @@ def _places(shape: Shape) -> Any:
     return (shape.center, shape.size, *([shape.angle] if np.ndim(shape.angle) else []))
 
 
-def _is_finite(shape: Shape) -> bool:
-    """Return whether all places and sizes of a shape are finite; a finite sum has finite terms."""
-    if isinstance(shape, Line):
-        total = shape.width + sum(map(sum, shape.points))
-    elif isinstance(shape, Disk):
-        total = shape.radius + sum(shape.center)
-    else:
-        total = float(np.sum(shape.angle)) + sum(shape.center) + sum(shape.size)
-    if isfinite(total):
-        return True
-    numbers = (getattr(shape, part.name) for part in fields(shape) if part.name not in ("name", "color"))
-    return all(np.isfinite(np.asarray(value, dtype=np.float64)).all() for value in numbers)
-
-
-def draw(names: Names, scenes: Sequence[Sequence[Shape]], extent: Extent) -> dict[str, Drawing]:
-    """Return a drawing by name for one scene a row; an empty scene clears what was there."""
-    extent.drawn.include(scenes)
+def draw_layer(names: Names, rows: Sequence[Sequence[ColoredShape]], order: float, step: float = 0.0) -> Drawings:
+    """Return a drawing by name of the shapes of each row, the next name `step` above; an empty row clears it."""
     return {
-        name: drawing_of(
-            names.kind(name), [[(s, s.color) for s in scene if s.name == name] for scene in scenes], 30.0 + i
-        )
-        for i, name in enumerate(names)
+        name: drawing_of(names.kind(name), [[pair for pair in row if pair[0].name == name] for row in rows], order)
+        for name, order in zip(names, order + step * np.arange(len(names)), strict=True)
     }
-
-
-def draw_ahead(
-    names: Names, scenes: Sequence[Sequence[Shape]], ahead: Sequence[Sequence[Sequence[Shape]]], extent: Extent
-) -> dict[str, Drawing]:
-    """Return a drawing by name for the predicted scenes of each row, the later the fainter.
-
-    A shape that does not move within the plan is not drawn again.
-    """
-    extent.predicted.include(scene for row in ahead for scene in row)
-    drawings: dict[str, Drawing] = {}
-    for name in names:
-        rows: list[list[tuple[Shape, Color]]] = []
-        for now, futures in zip(scenes, ahead, strict=True):
-            here = [s for s in now if s.name == name]
-            later = [(i, s) for i, scene in enumerate(futures) for s in scene if s.name == name and s not in here]
-            rows.append([(s, _fade(s.color, (i + 1) / (len(futures) + 1))) for i, s in reversed(later)])
-        drawings[name] = drawing_of(names.kind(name), rows, 10.0)
-    return drawings
-
-
-def draw_reference(
-    names: Names, scenes: Sequence[Sequence[Shape]], aims: Sequence[Sequence[Shape]], extent: Extent
-) -> dict[str, Drawing]:
-    """Return a drawing by name, in grey below all others, for the scene of the reference of each row.
-
-    In space nothing lies below: a shape at its reference is not drawn twice.
-    """
-    extent.drawn.include(aims)
-    if extent.in_space:
-        aims = [[s for s in aim if s not in now] for now, aim in zip(scenes, aims, strict=True)]
-    return {
-        name: drawing_of(names.kind(name), [[(s, _AIM) for s in aim if s.name == name] for aim in aims], 2.0)
-        for name in names
-    }
-
-
-class ReferenceScenes:
-    """The scene at the state that a reference names; no shapes where it names none."""
-
-    def __init__(self, about: About) -> None:
-        self._about = about
-        self._known: dict[bytes, Float[np.ndarray, " nx"] | None] = {}
-
-    def of(self, rows: StepRows, scene: Scene) -> list[list[Shape]]:
-        """Return the shapes of each row's reference."""
-        if self._about.cost is None or not len(rows.U):
-            return [[] for _ in rows.X]
-        moves = [rows.u_reference[min(i, len(rows.U) - 1)] for i in range(len(rows.X))]
-        states = [self._state(r) for r in rows.reference]
-        drawn: dict[tuple[bytes, bytes], list[Shape]] = {}  # most references stay for many rows
-        for x, u in zip(states, moves, strict=True):
-            if x is not None and (x.tobytes(), u.tobytes()) not in drawn:
-                drawn[x.tobytes(), u.tobytes()] = list(scene(x, u))
-        return [[] if x is None else drawn[x.tobytes(), u.tobytes()] for x, u in zip(states, moves, strict=True)]
-
-    def _state(self, reference: Float[np.ndarray, " nr"]) -> Float[np.ndarray, " nx"] | None:
-        """Return x with of(x) = r, of least size; None where r is not finite, or there is no such x."""
-        key = reference.tobytes()
-        if key not in self._known:
-            # states of so many different references are looked for
-            self._known[key] = self._find_state(reference) if len(self._known) < 2000 else None
-        return self._known[key]
-
-    def _find_state(self, reference: Float[np.ndarray, " nr"]) -> Float[np.ndarray, " nx"] | None:
-        assert self._about.cost is not None
-        of = bind_outputs(self._about.cost.of, self._about.states)
-        # the viewer draws in float32
-        if not (np.abs(reference) < 1e30).all():
-            return None
-        if of is None or of.names == self._about.states:
-            return reference.copy()
-        from scipy.optimize import least_squares
-
-        least = None
-        for first in (0.01, 2.0, -2.0):  # an angle from its sine and cosine has flat places between
-            fit = least_squares(lambda x: of(x) - reference, np.full(len(self._about.states), first))
-            if fit.cost < 1e-10 and (least is None or np.abs(fit.x).sum() < np.abs(least).sum()):
-                least = fit.x
-        return least
 
 
 class Scenes:
@@ -342,13 +251,13 @@ class Scenes:
 
     def __init__(self, about: About, scene: Scene | None) -> None:
         self.scene, self.extent = scene, Extent()
-        self._names, self._reference = Names(), ReferenceScenes(about)
+        self._about, self._names = about, Names()
         self._u: np.ndarray | None = None  # the last input
         self._ahead = False  # a plan was drawn before
+        self._targets: dict[bytes, Float[np.ndarray, " nx"] | None] = {}  # states of the references
+        self._aims: dict[bytes, list[Shape]] = {}  # scenes of the references; most stay for many rows
 
-    def draw_rows(
-        self, first: int, rows: StepRows, plans: Sequence[tuple[int, np.ndarray, np.ndarray]]
-    ) -> dict[str, Drawing]:
+    def draw_rows(self, first: int, rows: StepRows, plans: Sequence[tuple[int, np.ndarray, np.ndarray]]) -> Drawings:
         """Return the drawings of rows first, first + 1, … by entity; `plans` are steps with their planned X and U."""
         scene = self.scene
         if scene is None:
@@ -359,31 +268,74 @@ class Scenes:
                 later = ((X[i], U[min(i, len(U) - 1)]) for i in stages(len(U)))
                 ahead[k] = [self._names.check(scene(x, u), k) for x, u in later]
         now: list[list[Shape]] = []
-        for i, (x, y) in enumerate(zip(rows.X, rows.Y, strict=True)):
+        aims: list[list[Shape]] = []
+        for i, (x, y, reference) in enumerate(zip(rows.X, rows.Y, rows.reference, strict=True)):
             self._u = rows.U[i] if i < len(rows.U) else self._u
             x = y if np.isnan(x).any() and len(y) == len(x) else x
             shapes = None if self._u is None or not np.isfinite(x).all() else scene(x, self._u)
             now.append([] if shapes is None else self._names.check(shapes, first + i))
-        layers = {"world": draw(self._names, now, self.extent)}
+            aims.append(self._aim(reference, rows.u_reference[min(i, len(rows.U) - 1)], first) if len(rows.U) else [])
+        layers = {"world": draw_layer(self._names, [[(s, s.color) for s in shapes] for shapes in now], 30.0, 1.0)}
+        self.extent.drawn.include([*now, *aims])
         if ahead or self._ahead:
             self._ahead = True
             futures = [ahead.get(first + i, []) for i in range(len(now))]
-            layers["world/prediction"] = draw_ahead(self._names, now, futures, self.extent)
-        aims = self._reference.of(rows, scene)
+            self.extent.predicted.include(shapes for row in futures for shapes in row)
+            layers["world/prediction"] = draw_layer(self._names, list(map(_fade_plan, now, futures)), 10.0)
         if any(aims):
-            for aim in filter(None, aims):
-                self._names.check(aim, first)
-            layers["world/reference"] = draw_reference(self._names, now, aims, self.extent)
+            if self.extent.in_space:  # there nothing lies below: a shape at its reference is not drawn twice
+                aims = [[s for s in aim if s not in shapes] for shapes, aim in zip(now, aims, strict=True)]
+            layers["world/reference"] = draw_layer(self._names, [[(s, INK.aim) for s in aim] for aim in aims], 2.0)
         return {f"{layer}/{name}": drawing for layer, drawn in layers.items() for name, drawing in drawn.items()}
 
+    def _aim(self, reference: np.ndarray, u: np.ndarray, step: int) -> list[Shape]:
+        """Return the shapes at the state that a reference names; none where it names none."""
+        key = reference.tobytes()
+        if key not in self._targets:
+            # states of so many different references are looked for
+            self._targets[key] = self._find_target(reference) if len(self._targets) < 2000 else None
+        x = self._targets[key]
+        if x is None or self.scene is None:
+            return []
+        key += u.tobytes()
+        if key not in self._aims:
+            self._aims[key] = self._names.check(self.scene(x, u), step)
+        return self._aims[key]
 
-def stages(horizon: int) -> list[int]:
+    def _find_target(self, reference: Float[np.ndarray, " nr"]) -> Float[np.ndarray, " nx"] | None:
+        """Return x with of(x) = r, of least size; None where r is not finite, or there is no such x."""
+        # the viewer draws in float32
+        if self._about.cost is None or not (np.abs(reference) < 1e30).all():
+            return None
+        of = bind_outputs(self._about.cost.of, self._about.states)
+        if of is None or of.names == self._about.states:
+            return reference.copy()
+        from scipy.optimize import least_squares
+
+        # an angle from its sine and cosine has flat places between the starts
+        lifting = of
+        starts = [np.full(len(self._about.states), first) for first in (0.01, 2.0, -2.0)]
+        fits = [least_squares(lambda x: lifting(x) - reference, start) for start in starts]
+        return min((fit.x for fit in fits if fit.cost < 1e-10), key=lambda x: np.abs(x).sum(), default=None)
+
+
+def _fade_plan(now: Sequence[Shape], futures: Sequence[Sequence[Shape]]) -> list[ColoredShape]:
+    """Return the shapes of a plan that move, the later the fainter, the last one first."""
+    return [
+        (shape, _fade(shape.color, (i + 1) / (len(futures) + 1)))
+        for i, shapes in reversed(list(enumerate(futures)))
+        for shape in shapes
+        if shape not in now
+    ]
+
+
+def stages(horizon: int, most: int = 4) -> list[int]:
     """Return the few stages of a plan that are drawn, the last one among them."""
-    return sorted({round(horizon * (i + 1) / _STAGES) for i in range(_STAGES)} - {0})
+    return sorted({round(horizon * (i + 1) / most) for i in range(most)} - {0})
 
 
 def _fade(color: Color, share: float) -> Color:
     """Return `color` mixed with the background: Rerun draws lines without transparency."""
     weight = 0.45 + 0.5 * share
-    r, g, b = (round((1 - weight) * c + weight * d) for c, d in zip(color, BACKGROUND, strict=True))
+    r, g, b = (round((1 - weight) * c + weight * d) for c, d in zip(color, INK.background, strict=True))
     return r, g, b

@@ -14,8 +14,10 @@ from koopmpc.base.errors import LogError
 from koopmpc.base.scene import Color
 from koopmpc.views.figures.animation import Stroke, draw_frames, project, save_video
 from koopmpc.views.recording.description import title_of
-from koopmpc.views.recording.reader import LogColumns, about_of, naming, read_columns
-from koopmpc.views.recording.scenes import BACKGROUND, faces
+from koopmpc.views.recording.plots import INK
+from koopmpc.views.recording.reader import about_of
+from koopmpc.views.recording.rrd import LogColumns
+from koopmpc.views.recording.scenes import faces
 
 
 @dataclass
@@ -68,11 +70,11 @@ def export_video(
     """
     fps, width = checks.count(fps, "fps"), checks.count(width, "width", 64)
     speed = checks.positive(speed, "speed")
-    columns = read_columns(Path(log), ("/world/**", "/description", "/state"))
-    with naming(Path(log)):
-        about, _ = about_of(columns, Path(log))
+    columns = LogColumns(Path(log), "world/**", "description", "state")
+    with columns.reading():
+        about, _ = about_of(columns)
         layers = sorted(_layers(columns), key=lambda layer: layer.order)
-        last = max(len(columns.vectors("/state")) - 1, 1) * about.dt
+        last = max(len(columns.vectors("state")) - 1, 1) * about.dt
     if not layers:
         raise LogError(f"{log} has no scene to draw; give the Dynamics a method scene(x, u), or the plant a scene=")
     bodies = [s for one in layers if one.body for row in one.strokes for s in row]
@@ -86,7 +88,7 @@ def export_video(
         low=np.min([s.points.min(axis=0) - s.width / 2 for s in bodies], axis=0),
         high=np.max([s.points.max(axis=0) + s.width / 2 for s in bodies], axis=0),
         width=width,
-        background=BACKGROUND,
+        background=INK.background,
     )
     save_video(pictures, path, fps)
 
@@ -101,12 +103,12 @@ def _layers(columns: LogColumns) -> list[_Layer]:
     """Return the shapes that the log holds."""
     found: list[_Layer] = []
     for entity in columns.entities():
-        k, colors = columns.lists(entity, "colors")
+        k, shades = columns.lists(entity, "colors")
         if not len(k):
             continue
-        lower = next((i for i, part in enumerate(("reference", "prediction")) if f"/world/{part}/" in entity), 2)
+        lower = next((i for i, part in enumerate(("reference", "prediction")) if f"world/{part}/" in entity), 2)
         order = columns.static(entity, "draw_order")  # in the plane only
-        strokes = _strokes(columns, entity, [[_shade(number) for number in row or ()] for row in colors])
+        strokes = _strokes(columns, entity, [[_shade(number) for number in row or ()] for row in shades.to_pylist()])
         found.append(_Layer(lower if order is None else float(order), k, strokes, lower != 1))
     return found
 
@@ -115,7 +117,7 @@ def _strokes(columns: LogColumns, entity: str, colors: list[list[Color]]) -> lis
     """Return the strokes of each row of an entity: of its lines, its balls or its boxes."""
 
     def rows(what: str) -> list[Any]:
-        return [row or () for row in columns.lists(entity, what)[1]]
+        return [row or () for row in columns.lists(entity, what)[1].to_pylist()]
 
     boxes = zip(rows("half_sizes"), rows("centers"), rows("quaternions"), colors, strict=False)
     sides = [

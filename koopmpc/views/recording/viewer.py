@@ -18,7 +18,6 @@ from koopmpc.views.recording.rrd import check_log
 PORT = 9876  # data of a viewer: Rerun's default
 WEB_PORT = 9090  # page of a viewer in the browser: Rerun's default
 _START = 15.0  # longest wait for a viewer that was opened [s]
-_END = 5.0  # kill a server that still runs this long after it was asked to end [s]
 
 
 def find_viewer(port: int = PORT) -> str | None:
@@ -163,16 +162,7 @@ def serve(
     try:
         yield f"http://127.0.0.1:{port}?url=rerun%2Bhttp://127.0.0.1:{data}/proxy", data
     finally:
-        _stop(server)
-
-
-def _stop(server: "subprocess.Popen[bytes]") -> None:
-    """Ask the process to end, and kill it where it does not."""
-    server.terminate()
-    try:
-        server.wait(_END)
-    except subprocess.TimeoutExpired:
-        server.kill()
+        server.terminate()
         server.wait()
 
 
