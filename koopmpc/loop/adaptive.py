@@ -24,7 +24,6 @@ from koopmpc.models.predictors import LinearPredictor
 from koopmpc.validate.drift import DriftReport, exceeds_usual, find_drift
 
 _PERSISTENT = 3  # samples in sequence that are off before they count as a change of the plant
-_KEPT = 5  # earlier models that can be gone back to
 
 
 class LearnedPair(NamedTuple):
@@ -134,7 +133,7 @@ class Adaptive(Published):
         self._misfits: deque[float] = deque(maxlen=self._memory.maxlen)
         self._off = self._steps = 0
         self.learned = self.skipped = self.alarms = self.renewed = self.returned = self.refused = 0
-        self._good: deque[LinearPredictor] = deque(maxlen=_KEPT)
+        self._good: deque[LinearPredictor] = deque(maxlen=5)  # earlier models that can be gone back to
         self._on_trial: tuple[LinearPredictor, int] | None = None  # a new model, and the pairs learned before it
 
     @property

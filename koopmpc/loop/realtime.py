@@ -31,7 +31,6 @@ from koopmpc.plants.plant import Plant, read_measurement, require_plant
 
 Late = Literal["skip", "hold"]
 _SPIN = 3e-4  # the last part of a wait keeps the processor busy, because a sleep ends up to 0.2 ms late [s]
-_KEPT = 100_000  # steps whose jitter is kept
 
 
 @dataclass(eq=False)
@@ -59,7 +58,7 @@ class Paced:
     skipped: int = 0
     held: int = 0
     ended: str = "done"
-    jitter: deque[float] = field(default_factory=lambda: deque(maxlen=_KEPT))
+    jitter: deque[float] = field(default_factory=lambda: deque(maxlen=100_000))
 
     def __str__(self) -> str:
         """Return all of it in two lines."""
