@@ -1,7 +1,7 @@
 """The command line: each command parses, calls one function, and prints; and the words that `explain` knows."""
 
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from typing import Annotated, Any, cast
@@ -32,7 +32,6 @@ from koopmpc.base.errors import DataError, KoopmpcError, ProblemError
 
 app = typer.Typer(name="koopmpc", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
-IN_SHELL = [field.name for field in fields(FitOptions) if field.name != "reading"]
 FIT_HELP = {  # of the lists that a shell writes with commas
     "inputs": 'Columns that are inputs: u,v,… or 2; "" where there are none.',
     "columns": "Names to use: old=new,old=new,…; or of all columns: a,b,…",
@@ -87,7 +86,7 @@ def new(name: Annotated[str, typer.Argument(help="Name of the problem; the file 
 
 
 @app.command()
-@take_options(FitOptions, IN_SHELL, help=FIT_HELP)
+@take_options(FitOptions, help=FIT_HELP)
 def fit(
     data: Annotated[
         list[Path],

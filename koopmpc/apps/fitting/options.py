@@ -1,7 +1,7 @@
 """FitOptions: how logs are read, which models are tried, and what a controller is asked for, field by field."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from koopmpc.base.errors import DataError
@@ -42,8 +42,6 @@ class FitOptions:
         With a goal: seek a certificate of stability, and write its page.
     set_point
         With a goal: columns with set points of the loop that made the logs, r,s,…
-    reading
-        Further keywords of `load_episodes` for plain tables.
     """
 
     states: Sequence[str] | None = None
@@ -59,7 +57,6 @@ class FitOptions:
     margin: float | None = None
     certify: bool = False
     set_point: Sequence[str] = ()
-    reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def __post_init__(self) -> None:
         from koopmpc.base import checks  # the shell reads the fields of this class before it imports anything slow
@@ -75,8 +72,7 @@ class FitOptions:
 
     def list_reading(self) -> dict[str, Any]:
         """Return the keywords of `load_episodes` that are given."""
-        own = {name: getattr(self, name) for name in READING}
-        return {**self.reading, **{name: value for name, value in own.items() if value is not None}}
+        return {name: value for name in READING if (value := getattr(self, name)) is not None}
 
     def refuse_design(self) -> None:
         """Raise where an option is for a controller, and no goal is given."""
