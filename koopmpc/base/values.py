@@ -123,19 +123,20 @@ def freeze(value: object, **fields: object) -> None:
 
 def same(a: Any, b: Any) -> bool:
     """Return True where two trees of values are equal to the bit."""
+    x, y = a, b  # a match narrows the types of a and b
     match a, b:
         case np.ndarray(), np.ndarray():
-            return bool(a.dtype == b.dtype) and a.shape == b.shape and a.tobytes() == b.tobytes()
+            return bool(x.dtype == y.dtype) and x.shape == y.shape and x.tobytes() == y.tobytes()
         case (np.ndarray(), _) | (_, np.ndarray()):
             return False
         case float(), float():
             return a.hex() == b.hex()  # which tells −0 from 0, and no NaN from another
         case ((tuple() | list()), (tuple() | list())):
-            return len(a) == len(b) and all(map(same, a, b))
+            return len(x) == len(y) and all(map(same, x, y))
         case Mapping(), Mapping():
-            return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+            return x.keys() == y.keys() and all(same(x[key], y[key]) for key in x)
         case _:
-            return bool(a == b)
+            return bool(x == y)
 
 
 def to_data(value: Any, arrays: Arrays | None = None) -> Any:
