@@ -3,7 +3,6 @@
 import html
 import re
 import shlex
-import tomllib
 from dataclasses import replace
 from inspect import Parameter, signature
 from pathlib import Path
@@ -85,24 +84,6 @@ def test_the_line_that_a_template_prints_reads_logs_and_goal_as_the_template_was
     line = shlex.split(result.stdout.partition("then: ")[2])
     assert "read" in koopmpc(*line[line.index("fit") :]).stderr
     assert asked == [(("level [cm]", "temperature [degC]"), ("inflow [l/s]", "heater [kW]"), 1.0, 8, False)]
-
-
-@pytest.mark.slow
-def test_the_line_that_a_template_prints_designs_with_all_that_the_template_was_told(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    tank_logs(tmp_path / "csv", files=3, rows=150)
-    told = "--states level,temperature --inputs inflow,heater --resample 1 --horizon 8 --linear --name tank"
-    result = koopmpc("fit", "csv", *told.split(), "--goal-template")
-    assert result.exit_code == 0, result.output
-    line = shlex.split(result.stdout.partition("then: ")[2])
-    result = koopmpc(*line[line.index("fit") :])
-    assert result.exit_code == 0, result.output
-    (file,) = (tmp_path / "logs").glob("*-tank/controller.npz")
-    controller = km.load_controller(file)
-    assert controller.predictor.states == ("level [cm]", "temperature [degC]")
-    assert controller.predictor.inputs == ("inflow [l/s]", "heater [kW]")
-    assert (controller.dt, tomllib.loads(Path("goal.toml").read_text())["horizon"]) == (1.0, 8)
-    assert isinstance(controller.predictor, km.LinearPredictor)
 
 
 @pytest.mark.parametrize("how", ["", "--resample 1"])

@@ -3,7 +3,6 @@
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import koopmpc as km
@@ -137,12 +136,6 @@ def test_two_files_of_one_name_do_not_meet(tmp_path):
     second = km.load_problem(write(tmp_path / "b", **{"horizon=5": "horizon=6"}))
     assert (first.horizon, second.horizon) == (5, 6)
     assert type(first.dynamics) is not type(second.dynamics)
-
-
-def test_a_loaded_problem_holds_checked_arrays(tmp_path):
-    problem = km.load_problem(write(tmp_path))
-    x, u = problem.equilibrium
-    assert x.dtype == u.dtype == np.float64
 
 
 def test_a_new_problem_is_the_documented_one_and_is_never_overwritten(tmp_path, monkeypatch):
