@@ -122,22 +122,6 @@ def test_steps_of_a_copy_and_of_its_original_do_not_meet(duplicate, rows):
         np.testing.assert_array_equal(twin.plan().X, alone.plan().X)
 
 
-@pytest.mark.parametrize("duplicate", [copy.copy, lambda mpc: pickle.loads(pickle.dumps(mpc))])
-def test_a_copy_reads_rows_of_limits_on_its_own(duplicate):
-    ends = 0.2 + 0.01 * np.arange(12.0)[:, None]
-    alone, mpc = (km.KoopmanMPC(linear(A, B), COSTS["no target"], km.Limits(-ends, ends), N) for _ in range(2))
-    for _ in range(2):
-        alone([1.0, 0.0], [0.0, 0.0])
-        mpc([1.0, 0.0], [0.0, 0.0])
-    twin = duplicate(mpc)
-    for k in range(2, 12):
-        expected = alone([1.0, 0.0], [0.0, 0.0]).u
-        assert abs(expected) == pytest.approx(ends[k], rel=1e-9)
-        np.testing.assert_array_equal(twin([1.0, 0.0], [0.0, 0.0]).u, expected)
-        if k % 2:
-            mpc([1.0, 0.0], [0.0, 0.0])
-
-
 def test_what_noise_looks_like_to_an_estimator_sends_no_target_far_away():
     """A disturbed target may be out of the inputs' reach: where it meets their limits, the row's own target stays."""
 
