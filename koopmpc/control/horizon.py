@@ -21,8 +21,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from koopmpc.control.ask.terminal import EndRows
-from koopmpc.control.plan.tracking import LiftedTracking
+from koopmpc.control.plan.tracking import EndRows, LiftedTracking
 from koopmpc.control.riccati import Law, Stage
 from koopmpc.control.target import Targets, Units
 from koopmpc.models.predictors import LinearPredictor

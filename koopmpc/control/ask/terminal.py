@@ -8,14 +8,11 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.base.values import Interval, Value
-from koopmpc.lifting.base import Lifting, find_observables
-from koopmpc.lifting.state import State
-from koopmpc.models.predictors import LinearPredictor
+from koopmpc.lifting.base import Lifting
 
 _ADVICE = "make one with km.guarantees.find_terminal_set, or pass a Certificate"
 
@@ -101,7 +98,7 @@ class TerminalSet(Value):
             checks.kind(self.of, "of", Lifting, "for example km.State()")
         if self.feedback is not None:
             checks.kind(self.feedback, "feedback", TerminalFeedback, "km.guarantees.TerminalFeedback(u, K)")
-            _require_size(np.shape(self.feedback.K)[1], n, "feedback of the terminal set")
+            require_size(np.shape(self.feedback.K)[1], n, "feedback of the terminal set")
         if (self.H is None) == (self.W is None) or (self.H is None) != (self.h is None):
             raise DataError("a terminal set is a polytope, H and h, or an ellipsoid, W; pass one of the two")
         if self.W is not None:
@@ -148,46 +145,12 @@ class HasTerminalSet(Protocol):
         ...
 
 
-class EndRows(NamedTuple):
-    """F ξ_N − F c on ξ_N = z_N, or [z_N; u_{N−1}]: below 1 row by row, or below 1 in norm where it is a `ball`.
-
-    `places` (n, nz) reads the coordinates of the set `of` from z, of which the entry `constant` is 1.
-    """
-
-    F: Float[np.ndarray, "p nx"]
-    offset: Float[np.ndarray, " p"]
-    ball: bool
-    of: TerminalSet
-    places: Float[np.ndarray, "n nz"]
-    constant: int | None
-
-
 def read_terminal_set(given: object) -> TerminalSet:
     """Return the terminal set that a user passes."""
     found = given.terminal_set() if isinstance(given, HasTerminalSet) else given
     checks.kind(found, "terminal", TerminalSet, _ADVICE)
     assert isinstance(found, TerminalSet)
     return found
-
-
-def read_end(given: TerminalSet | HasTerminalSet, predictor: LinearPredictor) -> EndRows:
-    """Return the rows of a terminal set on the lifted state of a predictor."""
-    wanted, names, nz, nu = read_terminal_set(given), predictor.states, predictor.nz, predictor.nu
-    if wanted.of is None:
-        E = np.eye(nz)
-    else:
-        bound = wanted.of.bind(names)
-        whole = np.eye(nz)
-        E = (
-            predictor.C[bound.state_indices]
-            if isinstance(bound, State)
-            else whole[find_observables(predictor.lifting, bound)]
-        )
-    places = E if wanted.kept is None else E[list(wanted.kept)]
-    E = block_diag(places, np.eye(nu)) if wanted.with_input else places
-    F, center = wanted.rows, np.asarray(wanted.center)
-    _require_size(len(center), len(E))
-    return EndRows(F @ E, -F @ center, wanted.is_ellipsoid, wanted, places, predictor.lifting.constant_index)
 
 
 def terminal_function(wanted: TerminalSet, states: tuple[str, ...], nu: int) -> ca.Function:
@@ -202,7 +165,7 @@ def terminal_feedback(wanted: TerminalSet, states: tuple[str, ...], nu: int) -> 
     law = wanted.feedback
     assert law is not None, "only asked where the set has a feedback"
     x, u, away = _trace_deviation(wanted, states, nu)
-    _require_size(len(np.asarray(law.u)), nu, "feedback of the terminal set")
+    require_size(len(np.asarray(law.u)), nu, "feedback of the terminal set")
     v = ca.mtimes(ca.DM(np.asarray(law.K)), away)
     if law.K_w is not None:
         v = ca.solve(ca.SX.eye(nu) - ca.mtimes(ca.DM(np.asarray(law.K_w)), ca.kron(ca.SX.eye(nu), away)), v)
@@ -216,11 +179,12 @@ def _trace_deviation(wanted: TerminalSet, states: tuple[str, ...], nu: int) -> t
     xi = xi if wanted.kept is None else xi[list(wanted.kept), 0]
     xi = ca.vertcat(xi, u) if wanted.with_input else xi
     center = np.asarray(wanted.center)
-    _require_size(len(center), xi.size1())
+    require_size(len(center), xi.size1())
     return x, u, xi - ca.DM(center)
 
 
-def _require_size(had: int, wanted: int, what: str = "terminal set") -> None:
+def require_size(had: int, wanted: int, what: str = "terminal set") -> None:
+    """Raise where a set has another number of coordinates than a model."""
     if had != wanted:
         raise ShapeError(
             f"the {what} has {had} coordinates, the model {wanted}; make the set of this model, or name its"

@@ -12,7 +12,6 @@ from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError
 from koopmpc.control.ask.limits import Interval, Softness, preview_margin
-from koopmpc.control.ask.terminal import EndRows, read_end
 from koopmpc.control.horizon import Condensed, Horizon, Terminal, WeightRows, build_stages, condense, horizon_of
 from koopmpc.control.plan.condensed_program import (
     CondensedPlan,
@@ -24,7 +23,7 @@ from koopmpc.control.plan.condensed_program import (
 )
 from koopmpc.control.plan.in_time import BoundRows, PlansInTime, describe_bounds
 from koopmpc.control.plan.task import ControlTask, tie_moves
-from koopmpc.control.plan.tracking import LiftedTracking, soften_end
+from koopmpc.control.plan.tracking import EndRows, LiftedTracking, read_end, soften_end
 from koopmpc.control.program import no_export, reference_table, refuse_time_limit
 from koopmpc.control.riccati import Law, Stage, recursion
 from koopmpc.control.solvers import FINISHER

@@ -11,11 +11,11 @@ from koopmpc.base.values import Interval
 from koopmpc.control.ask.bounds import refuse_crossed_rows
 from koopmpc.control.ask.limits import Limits, preview_margin
 from koopmpc.control.ask.preview import check_bounds_alone, require_movable, require_preview
-from koopmpc.control.ask.terminal import EndReach, EndRows, measure_reach, read_end, require_inside
+from koopmpc.control.ask.terminal import EndReach, measure_reach, require_inside
 from koopmpc.control.horizon import WeightRows
 from koopmpc.control.plan.condensed_program import BoundsProgram, CondensedPlan, StepBounds, find_reach
 from koopmpc.control.plan.task import ControlTask
-from koopmpc.control.plan.tracking import LiftedTracking
+from koopmpc.control.plan.tracking import EndRows, LiftedTracking, read_end
 from koopmpc.control.target import ROUNDING, Targets
 
 _SHARE = 1e-5  # a rate that gives way by more than this share of its allowance is reported

@@ -7,6 +7,7 @@ from typing import Generic, NamedTuple, TypeAlias, TypeVar
 import casadi as ca
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.linalg import block_diag
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
@@ -15,6 +16,7 @@ from koopmpc.control.ask.bounds import SOFTENED, SizedLimits, spread_prices
 from koopmpc.control.ask.cost import Cost, check_cost_and_limits, refuse_stage, refuse_steps
 from koopmpc.control.ask.levels import InputLevels
 from koopmpc.control.ask.limits import LINEAR, QUADRATIC, Interval, Limits, Movable, Softness, half_width, magnitude
+from koopmpc.control.ask.terminal import HasTerminalSet, TerminalSet, read_terminal_set, require_size
 from koopmpc.lifting.base import Lifting, find_observables
 from koopmpc.lifting.state import State
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
@@ -279,3 +281,37 @@ def select_rows(predictor: LinearPredictor, of: Lifting) -> Float[np.ndarray, "n
     if isinstance(wanted, State):
         return predictor.C[wanted.state_indices]
     return np.eye(predictor.nz)[find_observables(predictor.lifting, wanted)]
+
+
+class EndRows(NamedTuple):
+    """F ξ_N − F c on ξ_N = z_N, or [z_N; u_{N−1}]: below 1 row by row, or below 1 in norm where it is a `ball`.
+
+    `places` (n, nz) reads the coordinates of the set `of` from z, of which the entry `constant` is 1.
+    """
+
+    F: Float[np.ndarray, "p nx"]
+    offset: Float[np.ndarray, " p"]
+    ball: bool
+    of: TerminalSet
+    places: Float[np.ndarray, "n nz"]
+    constant: int | None
+
+
+def read_end(given: TerminalSet | HasTerminalSet, predictor: LinearPredictor) -> EndRows:
+    """Return the rows of a terminal set on the lifted state of a predictor."""
+    wanted, names, nz, nu = read_terminal_set(given), predictor.states, predictor.nz, predictor.nu
+    if wanted.of is None:
+        E = np.eye(nz)
+    else:
+        bound = wanted.of.bind(names)
+        whole = np.eye(nz)
+        E = (
+            predictor.C[bound.state_indices]
+            if isinstance(bound, State)
+            else whole[find_observables(predictor.lifting, bound)]
+        )
+    places = E if wanted.kept is None else E[list(wanted.kept)]
+    E = block_diag(places, np.eye(nu)) if wanted.with_input else places
+    F, center = wanted.rows, np.asarray(wanted.center)
+    require_size(len(center), len(E))
+    return EndRows(F @ E, -F @ center, wanted.is_ellipsoid, wanted, places, predictor.lifting.constant_index)
