@@ -30,7 +30,7 @@ LONGEST = [
     "apps/test_fit.py",
     "faults/test_sweeps.py",
     "loop/test_realtime.py",
-    "codegen/test_bilinear.py",
+    "codegen/test_parity.py",
     "test_parallel.py",
     "apps/test_check.py",
     "test_reading.py",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from tests.control.models import Told
+from tests.codegen import plants
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
 LIMITS = km.Limits(u_min=-25.0, u_max=25.0)
@@ -122,22 +122,6 @@ def test_a_compiler_that_fails_shows_its_first_error(controller, monkeypatch, tm
         assert km.compiled(controller) is controller
 
 
-def test_what_cannot_be_written_in_c_says_which_part_and_what_would_do(pendulum):
-    plant, model = pendulum
-    nonlinear = km.NonlinearMPC(plant, COST, LIMITS, 5)
-    with pytest.raises(km.errors.DataError, match=r"a NonlinearMPC cannot be exported: .*; export a KoopmanMPC"):
-        km.compiled(nonlinear)
-    late = km.KoopmanMPC(model, COST, LIMITS, 5, time_limit=0.01)
-    with pytest.raises(km.errors.DataError, match=r"time_limit, and C has no clock.*iter_limit"):
-        km.compiled(late)
-
-
-def test_an_estimator_of_ones_own_is_refused_by_name(pendulum):
-    mine = km.KoopmanMPC(pendulum[1], COST, LIMITS, 5, estimator=Told([0.0] * pendulum[1].nz))
-    with pytest.raises(km.errors.DataError, match="the estimator Told cannot be written in C; use"):
-        km.compiled(mine)
-
-
 @pytest.mark.parametrize("kind", ["linear", "staged"])
 def test_a_rehearsal_changes_nothing(fast, pendulum, kind):
     one = fast if kind == "linear" else km.compiled(km.BilinearMPC(pendulum[0], COST, LIMITS, 6))
@@ -160,3 +144,75 @@ def test_copies_that_meet_other_rows_keep_the_targets_of_their_own(pendulum):
         for sign, (fast, slow) in zip((1.0, -1.0), loops, strict=True):
             reference[:, 0] = 0.02 * sign * (k + np.arange(9))
             np.testing.assert_allclose(fast([0.1, 0.0], reference).u, slow([0.1, 0.0], reference).u, atol=1e-4)
+
+
+def test_a_pickle_goes_on_with_the_targets_that_it_knew():
+    fast = km.compiled(km.BilinearMPC(plants.make_swung()[1], COST, km.Limits(-8.0, 8.0), 10))
+    fast([0.5, 0.0], [0.1, 0.0])
+    twin, other = pickle.loads(pickle.dumps(fast)), copy.copy(fast)
+    for x in ([0.45, -0.1], [0.4, -0.2]):
+        moves = [one(x, [0.1, 0.0]) for one in (fast, twin, other)]
+        assert moves[0].u == moves[1].u == moves[2].u
+    assert other([0.4, 0.0], [0.2, 0.0]).status is km.Status.UNCONSTRAINED
+
+
+# limits that move in time, or come with a call
+
+ROWS = np.random.default_rng(0).uniform(0.3, 1.2, (40, 2))
+
+
+def compile_pair(limits):
+    own = km.KoopmanMPC(plants.make_pair()[0], km.Cost(Q=[1, 0.5], R=0.05), limits, 6)
+    return own, km.compiled(own)
+
+
+def twins_of(fast):
+    return copy.copy(fast), pickle.loads(pickle.dumps(fast))
+
+
+def test_copies_go_on_at_the_same_row_of_limits():
+    fast = compile_pair(km.Limits(u_min=-1, u_max=ROWS))[1]
+    for _ in range(5):
+        fast([1.0, -0.5], [1, 0])
+    twins, u = twins_of(fast), fast([0.8, -0.5], [1, 0]).u
+    for twin in twins:
+        np.testing.assert_array_equal(twin([0.8, -0.5], [1, 0]).u, u)
+
+
+def test_copies_forget_the_limits_of_a_call_as_the_original_does():
+    fast = compile_pair(km.Limits(u_min=-1, u_max=1, rows=("x_max",)))[1]
+    at_call = fast.limits.with_bounds(u_max=0.2)
+    held = fast([1.0, -0.5], [0, 0], limits=at_call).u
+    twin, same = pickle.loads(pickle.dumps((fast, at_call)))
+    np.testing.assert_allclose(twin([1.0, -0.5], [0, 0], limits=same).u, held, atol=1e-9)
+    fast.rehearse()
+    twins, u = twins_of(fast), fast([1.0, -0.5], [1, 0]).u
+    assert u.max() > 0.2
+    for twin in twins:
+        np.testing.assert_array_equal(twin([1.0, -0.5], [1, 0]).u, u)
+
+
+def test_pages_of_limits_are_turned_where_one_ends_and_where_a_run_begins_again(monkeypatch):
+    monkeypatch.setattr("koopmpc.codegen.compiled._PAGE", 7)
+    own, fast = compile_pair(km.Limits(-ROWS, ROWS[::-1], x_max=[1.4, np.inf]))
+    for _ in range(2):
+        own.reset()
+        fast.reset()
+        for k in range(50):
+            x = [np.cos(k), np.sin(k)]
+            np.testing.assert_allclose(fast(x, [0.1, 0.0]).u, own(x, [0.1, 0.0]).u, atol=1e-6)
+    one, other = own([0.1, 0.0], [0.0, 0.0]), pickle.loads(pickle.dumps(fast))([0.1, 0.0], [0.0, 0.0])
+    np.testing.assert_allclose(other.u, one.u, atol=1e-6)
+
+
+def test_limits_of_a_call_that_are_refused_leave_nothing_behind():
+    y, r, fast = [1.0, 0.0], [0.0, 0.0], compile_pair(km.Limits(-1, 1, rows=("u_max",)))[1]
+    narrow, short = fast.limits.with_bounds(u_max=0.2), fast.limits.with_bounds(u_max=np.ones((2, 2)))
+    used = fast(y, r, limits=narrow).u
+    with pytest.raises(km.errors.ShapeError):
+        fast(y, r, limits=short)
+    with pytest.raises(km.errors.DataError, match="without a limit there"):
+        fast(y, r, limits=fast.limits.with_bounds(du_max=0.1))
+    with pytest.raises(km.errors.DataError, match="keeps its own"):
+        compile_pair(km.Limits(-1, 1))[1](y, r, limits=narrow)
+    np.testing.assert_allclose(copy.copy(fast)(y, r, limits=narrow).u, used, atol=1e-9)

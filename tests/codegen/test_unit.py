@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.codegen import plants
 from tests.commands import koopmpc
 from tests.compiler import find_compiler, needs_compiler
 from tests.tiers import few
@@ -50,7 +51,7 @@ class Unit:
         return np.array(u), (self.slave.getInteger if self.is_two else self.slave.getInt32)(whole)
 
 
-def controllers(pendulum, cart):
+def controllers(pendulum):
     plant, model = pendulum
     yield "feedback", km.LQR(model, COST), 2
     yield "condensed", km.KoopmanMPC(model, COST, LIMITS, horizon=20, solver="daqp"), 2
@@ -61,14 +62,20 @@ def controllers(pendulum, cart):
         km.KoopmanMPC(model, COST, LIMITS, 20, solver="daqp", estimator=km.LiftedKalman(["theta", "omega"])),
         2,
     )
-    yield "pushed", km.KoopmanMPC(cart, km.Cost(Q=[10, 1], R=[0.1, 0.2]), km.Limits(-1, 1), horizon=8, solver="daqp"), 2
+    yield (
+        "pushed",
+        km.KoopmanMPC(
+            plants.make_cart()[1], km.Cost(Q=[10, 1], R=[0.1, 0.2]), km.Limits(-1, 1), horizon=8, solver="daqp"
+        ),
+        2,
+    )
 
 
 @pytest.mark.parametrize("version", few([2, 3], 3))
-def test_a_closed_loop_with_the_unit_is_that_with_the_controller(version, pendulum, cart, tmp_path):
+def test_a_closed_loop_with_the_unit_is_that_with_the_controller(version, pendulum, tmp_path):
     plant, rows = pendulum[0], np.repeat([[0.0, 0.0], [0.3, 0.0]], 12, axis=0)
     rng, seen = np.random.default_rng(0), set()
-    for name, mpc, nx in controllers(pendulum, cart):
+    for name, mpc, nx in controllers(pendulum):
         km.export(mpc, tmp_path / name, fmu=version)
         x = np.array([0.6, 0.0])
         unit = Unit(tmp_path / name / "koopmpc.fmu", x)
