@@ -30,6 +30,10 @@ from koopmpc.plants.step_map import StepMap
 
 _ROOM = 2**20  # numbers of a table of given input targets: 8 MB
 _PAGE = 1024  # steps whose limits are made at once, which takes one of them 0.1 ms
+_OWN_LIMITS = (
+    "limits were passed, and this C code keeps its own; compile one whose limits have rows in time,"
+    ' or Limits(rows=("u_max",))'
+)
 
 
 class NoCompilerWarning(UserWarning):
@@ -141,8 +145,8 @@ class Compiled(CompiledLoops):
         self._pointer = ctypes.c_void_p(ctypes.addressof(frame))
         self._reference_pointer = ctypes.byref(frame.reference)
         self._call = self._code.koopmpc_call
-        self._page: BoundPage | None = None
-        self._passed: BoundPage | None = None  # the limits of the last call that had other ones than the last
+        self._pages: dict[bool, BoundPage] = {}  # the controller's own limits, and those of a call
+        self._in_c: BoundPage | None = None  # what C was passed last
         self._y_shape, self._row_shape, self._row = (self._ny,), (self._nr,), self._reference[0]
         self._rows_shape = self._reference.shape
         self._count, self._has_extras, self._is_double = 1, False, not single
@@ -163,8 +167,7 @@ class Compiled(CompiledLoops):
             for value, name, size in ((x0, "x0", self._sizes["NX"]), (u_prev, "u_prev", self.nu))
         )
         self._code.koopmpc_init(point_to(self._memory), point_to(start), point_to(last))
-        if self._timed and self._page is None:
-            self._turn_page()
+        self._in_c = None
         self._aim(np.zeros((0, self._nr)))
 
     def _aim(self, rows: Float[np.ndarray, "..."]) -> None:
@@ -202,45 +205,25 @@ class Compiled(CompiledLoops):
         arrays = [np.ascontiguousarray(np.clip(end, -checks.HUGE, checks.HUGE), kind) for end in ends]
         return BoundPage(first, arrays, ahead, steps)
 
-    def _turn_page(self) -> BoundPage:
-        """Return the limits of this step and of those after it."""
-        assert self.limits is not None, "they have rows"
-        page = self._page = self._fill_bounds(self.limits, self._step, _PAGE)
-        return page
-
-    def _move_limits(self, limits: Limits | None) -> None:
-        """Set the limits of this step: those of the call, or the controller's own."""
-        if limits is not None and self._bounds is None:
-            raise DataError(
-                "limits were passed, and this C code keeps its own; compile one whose limits have rows in time,"
-                ' or Limits(rows=("u_max",))'
-            )
-        if limits is not None:
-            if limits is not self._at_call:
-                original = cast("Any", self.original)
-                read = original.read_limits(limits)
-                original.check_limits(read)
-                self._called_with = read
-            if limits is not self._at_call or self._passed is None:
-                self._passed = self._fill_bounds(self._called_with, 0, 1)
-            self._at_call = limits
-        elif self.limits is not None:
-            self._at_call, self._passed = None, self._fill_bounds(self.limits, 0, 1)
-        self._frame.bounds = None if self._passed is None else self._passed.at(0)
-
     def _choose_limits(self, limits: Limits | None) -> None:
-        """Pass the limits of this step, and count it: those of the call, of the row in time, or C's own again."""
-        frame = self._frame
-        if limits is not None or (self._at_call is not None and not self._timed):
-            self._move_limits(limits)
-            self._step += 1
-        elif self._timed:
-            page, step, self._at_call = self._page, self._step, None
-            if page is None or not 0 <= step - page.first < _PAGE:
-                page = self._turn_page()
-            frame.bounds, self._step = page.at(step), step + 1
-        else:  # C has the limits of the last call
-            frame.bounds = self._passed = None
+        """Pass the limits of this step, where C has others, and count it: of the call, or the controller's own."""
+        now, timed = (self.limits, self._timed) if limits is None else (limits, False)
+        if now is None:
+            return
+        if limits is not None and limits is not self._at_call:
+            original = cast("Any", self.original)
+            read = original.read_limits(limits)
+            original.check_limits(read)
+            self._called_with = read
+        self._at_call, step = limits, self._step if timed else 0
+        page = self._pages.get(limits is None)
+        if page is None or page.of is not now or not 0 <= step - page.first < page.steps:
+            read = now if limits is None else self._called_with
+            page = self._pages[limits is None] = self._fill_bounds(read, step, _PAGE if timed else 1)
+            page.of = now
+        self._frame.bounds = page.at(step) if timed or page is not self._in_c else None
+        self._in_c = page
+        self._step += 1
 
     def _read_reference(self, reference: ArrayLike) -> None:
         """Write the rows of a reference into the frame, and find the targets of new ones."""
@@ -284,8 +267,10 @@ class Compiled(CompiledLoops):
             self._read_reference(reference)
             if applied is not None or w is not None or self._has_extras:
                 self._pass_extras(applied, w)
-            if limits is not None or self._timed or self._at_call is not None or self._passed is not None:
+            if self._bounds is not None:
                 self._choose_limits(limits)
+            elif limits is not None:
+                raise DataError(_OWN_LIMITS)
             self._call(self._pointer)
             u = self._u.copy() if self._is_double else self._u.astype(np.float64)
             if not frame.status and not frame.refused:

@@ -68,6 +68,7 @@ class BoundPage:
 
     def __init__(self, first: int, arrays: list[np.ndarray], ahead: int, steps: int) -> None:
         self.first, self.steps, self._arrays = first, steps, arrays  # C holds pointers only
+        self.of: object = None  # the limits that these are
         self._table = np.zeros(steps, _BOUND_ROWS)
         for name, array in zip(_BOUNDS, arrays, strict=True):
             self._table[name]["values"] = array.ctypes.data + np.arange(steps) * array.strides[0]

@@ -296,6 +296,8 @@ def _derive_staged(tables: Tables, p: StagedProgram) -> None:
         "MOST_TERMS": max(motion.ORDERS) + 1,
     }
     tables.arrays |= {"table": p.table.ravel(), "orders": np.array(motion.ORDERS, dtype=np.intc)}
+    for name in {"rest_weight", "Q_root", "R_root", "tail_end"} & tables.arrays.keys():  # C has these row after row
+        tables.arrays[name] = tables.arrays[name].reshape(tables.sizes[f"{name.upper()}_WIDTH"], -1).T.ravel()
     tables.notes += [_TABLE_NOTE, *([_SCHEDULE_NOTE] if p.scheduled else [])]
     low, high = (end[0] for end in p.stage_limits)
     limited = np.tile(np.isfinite(low) | np.isfinite(high), (N, 1))

@@ -42,36 +42,20 @@ class TargetTable:
 
     def __init__(self, find: Callable[[np.ndarray], np.ndarray], kind: type[np.floating]) -> None:
         self._find, self._kind, self._lock = find, kind, Lock()
-        self._known: set[bytes] = set()
-        self._room = self._table = np.zeros((0, 1), kind)
+        self._known: dict[bytes, np.ndarray] = {}
+        self._table = np.zeros((0, 1), kind)
 
     def of(self, reference: Float[np.ndarray, "..."]) -> Float[np.ndarray, "found size"]:
         """Return the table with the rows of this reference in it: the same array while no row is new."""
         with self._lock:
-            rows = np.ascontiguousarray(np.atleast_2d(reference))
-            keys, width = rows.tobytes(), rows.shape[1] * rows.itemsize
-            if self._known.issuperset([keys[i : i + width] for i in range(0, len(keys), width)]):
-                return self._table
-            rows = rows[np.abs(rows).max(axis=1, initial=0.0) < checks.HUGE]
+            rows = {row.tobytes(): row for row in np.atleast_2d(reference) if np.abs(row).max(initial=0) < checks.HUGE}
             if len(self._known) + len(rows) > _ROWS:
-                self._known, self._table = set(), np.zeros((0, 1), self._kind)
-            new = [row for row in rows if row.tobytes() not in self._known]
+                self._known = {}
+            new = [key for key in rows if key not in self._known]
             if new:
-                self._append(self._find(np.array(new)))
-                self._known |= {row.tobytes() for row in new}
+                self._known |= zip(new, self._find(np.array([rows[key] for key in new])), strict=True)
+                self._table = np.array(list(self._known.values()), self._kind)  # C may still read the one before
             return self._table
-
-    def _append(self, found: Float[np.ndarray, "new size"]) -> None:
-        """Add rows. A table that was returned before keeps its rows, for C may still read it."""
-        first = len(self._table)
-        last = first + len(found)
-        if first == 0 or last > len(self._room):
-            room = np.zeros((2 * last, found.shape[1]), self._kind)
-            if first:
-                room[:first] = self._table
-            self._room = room
-        self._room[first:last] = found
-        self._table = self._room[:last]
 
 
 class ControllersAbreast:
@@ -160,6 +144,10 @@ class CompiledLoops:
 
     def _aim(self, rows: Float[np.ndarray, "..."]) -> None:
         """Pass the targets of these rows to the C code."""
+        raise NotImplementedError
+
+    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
+        """Forget all earlier steps."""
         raise NotImplementedError
 
     @alone
@@ -257,14 +245,17 @@ class CompiledLoops:
         if code is None:
             raise DataError("the plant, or a controller of floats, cannot run in C as a whole; use km.simulate")
         rows = np.ascontiguousarray(given[np.minimum(np.arange(T + self.horizon + 1), len(given) - 1)])
-        self._aim(given)
-        E = len(starts)
+        E, Y = len(starts), np.empty((T + 1, self._ny))
         X, U = np.empty((E, T + 1, starts.shape[1])), np.empty((E, T, self.nu))
         X[:, 0] = starts
         slack, reports = np.zeros((E, T)), np.zeros((E, T, 4), dtype=np.intc)
-        arrays = {"rows": rows, "X": X, "Y": np.empty((T + 1, self._ny)), "U": U, "slack": slack, "reports": reports}
-        whole = gather_run(code, T, arrays, None, preview=True)
-        self._code.koopmpc_runs(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)), ctypes.c_long(E))
+        for e, start in enumerate(starts):
+            self.reset(start if len(start) == self._sizes["NX"] else None)
+            self._aim(given)
+            code.plant_measure(point_to(X[e]), point_to(Y))
+            arrays = {"rows": rows, "X": X[e], "Y": Y, "U": U[e], "slack": slack[e], "reports": reports[e]}
+            whole = gather_run(code, T, arrays, None, preview=True)
+            self._code.koopmpc_run(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)))
         return ManyRuns(X, U, reports[..., 0], reports[..., 1], slack)
 
     def _compile_plant(self, plant: StepMap) -> ctypes.CDLL | None:

@@ -57,26 +57,6 @@ DOOR void koopmpc_run(koopmpc_frame *f, const koopmpc_whole *run) {
     run->measure(x + run->nx, run->Y + (k + 1) * run->ny);
   }
 }
-/* Runs from many states, one after the other, each after a reset; Y holds one run. */
-DOOR void koopmpc_runs(koopmpc_frame *f, koopmpc_whole *run, long runs) {
-#if KOOPMPC_IS_STAGED
-  const koopmpc_real *targets = f->state->targets;
-  const int count = f->state->target_count;
-#endif
-  for (long e = 0; e < runs; e++) {
-    koopmpc_init(f->state, KOOPMPC_NX == run->nx ? run->X : 0, 0);
-#if KOOPMPC_IS_STAGED
-    koopmpc_use_targets(f->state, targets, count);
-#endif
-    run->measure(run->X, run->Y);
-    koopmpc_run(f, run);
-    run->X += (run->steps + 1) * run->nx;
-    run->U += run->steps * KOOPMPC_NU;
-    run->slack += run->steps;
-    run->reports += 4 * run->steps;
-  }
-}
-
 /* One step of many controllers side by side, each with a state of its own; `which` names those that take it. */
 typedef struct {
   long count, size, stride;

@@ -72,10 +72,6 @@ void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
       s->low[FIRST + j] = x_low[OUT + j] + koopmpc_bounds_margin[i * KOOPMPC_N + k];
       s->high[FIRST + j] = x_high[OUT + j] - koopmpc_bounds_margin[i * KOOPMPC_N + k];
     }
-  for (int i = KOOPMPC_PLANNED; i < KOOPMPC_PLANNED + 2 * KOOPMPC_CHECKED_COUNT; i++) {
-    s->low[i] = -KOOPMPC_HUGE;
-    s->high[i] = KOOPMPC_HUGE;
-  }
   for (int k = 0; k <= KOOPMPC_N && KOOPMPC_AIMED; k++) { /* limits of the target of this row */
     koopmpc_real *low = s->target_low + k * KOOPMPC_NL, *high = s->target_high + k * KOOPMPC_NL;
     for (int i = 0; i < NU; i++) {
@@ -87,48 +83,33 @@ void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
       high[NU + i] = x_high[k * OUT + i] - koopmpc_bounds_values[NU + i];
     }
   }
+  koopmpc_real below[KOOPMPC_NL + 1], above[KOOPMPC_NL + 1]; /* the tightest limits of a target */
+  koopmpc_copy(below, s->target_low, KOOPMPC_NL);
+  koopmpc_copy(above, s->target_high, KOOPMPC_NL);
+  for (int k = 1; k < AHEAD; k++)
+    for (int i = 0; i < KOOPMPC_NL; i++) {
+      const koopmpc_real low = s->target_low[k * KOOPMPC_NL + i], high = s->target_high[k * KOOPMPC_NL + i];
+      below[i] = low > below[i] ? low : below[i];
+      above[i] = high < above[i] ? high : above[i];
+    }
 #if KOOPMPC_AIMED
   const koopmpc_real before = s->unpushed;
   s->unpushed = KOOPMPC_HUGE;
-  for (int i = 0; i < NU + OUT; i++) { /* the tightest limits of a target |r| times its gain away from its offset */
-    enum { LANES = 8 };
-    koopmpc_real lower[LANES], upper[LANES], below = -KOOPMPC_HUGE, above = KOOPMPC_HUGE, room;
-    int k = 0;
-    koopmpc_fill(lower, below, LANES);
-    koopmpc_fill(upper, above, LANES);
-    for (; k + LANES <= AHEAD; k += LANES)
-      for (int j = 0; j < LANES; j++) {
-        const koopmpc_real low = s->target_low[(k + j) * KOOPMPC_NL + i], high = s->target_high[(k + j) * KOOPMPC_NL + i];
-        lower[j] = low > lower[j] ? low : lower[j];
-        upper[j] = high < upper[j] ? high : upper[j];
-      }
-    for (; k < AHEAD; k++) {
-      const koopmpc_real low = s->target_low[k * KOOPMPC_NL + i], high = s->target_high[k * KOOPMPC_NL + i];
-      below = low > below ? low : below;
-      above = high < above ? high : above;
-    }
-    for (int j = 0; j < LANES; j++) {
-      below = lower[j] > below ? lower[j] : below;
-      above = upper[j] < above ? upper[j] : above;
-    }
-    below = koopmpc_targets_shift[i] - below;
-    above -= koopmpc_targets_shift[i];
-    room = below < above ? below : above;
+  for (int i = 0; i < NU + OUT; i++) { /* a target is |r| times its gain away from its offset, at most */
+    const koopmpc_real down = koopmpc_targets_shift[i] - below[i], up = above[i] - koopmpc_targets_shift[i];
+    koopmpc_real room = down < up ? down : up;
     room = koopmpc_targets_gain[i] > 0 ? room / koopmpc_targets_gain[i] : room < 0 ? -1 : KOOPMPC_HUGE;
     s->unpushed = room < s->unpushed ? room : s->unpushed;
   }
   if (!KOOPMPC_DISTURBANCE_WIDTH && !(s->peak <= before && s->peak <= s->unpushed)) s->aimed = 0; /* else no target moves */
 #endif
-  for (int i = 0; i < KOOPMPC_CHECKED_COUNT; i++) { /* the tightest of them, which a plan is tested by */
+  for (int i = 0; i < KOOPMPC_CHECKED_COUNT; i++) { /* which a plan is tested by */
     const int at = koopmpc_bounds_checked[i];
-    koopmpc_real *low = s->low + KOOPMPC_PLANNED + i, *high = s->high + KOOPMPC_PLANNED + KOOPMPC_CHECKED_COUNT + i;
     const koopmpc_real reach = KOOPMPC_ROUNDING * koopmpc_targets_size[at];
-    for (int k = 0; k <= KOOPMPC_N; k++) {
-      const koopmpc_real below = s->target_low[k * KOOPMPC_NL + at] - reach;
-      const koopmpc_real above = s->target_high[k * KOOPMPC_NL + at] + reach;
-      *low = below > *low ? below : *low;
-      *high = above < *high ? above : *high;
-    }
+    s->low[KOOPMPC_PLANNED + i] = koopmpc_clip(below[at] - reach, -KOOPMPC_HUGE, KOOPMPC_HUGE);
+    s->high[KOOPMPC_PLANNED + i] = KOOPMPC_HUGE;
+    s->low[KOOPMPC_PLANNED + KOOPMPC_CHECKED_COUNT + i] = -KOOPMPC_HUGE;
+    s->high[KOOPMPC_PLANNED + KOOPMPC_CHECKED_COUNT + i] = koopmpc_clip(above[at] + reach, -KOOPMPC_HUGE, KOOPMPC_HUGE);
   }
 }
 

@@ -23,19 +23,6 @@
 #define PLANNED KOOPMPC_PLANNED
 #define ROWS KOOPMPC_QP_M
 
-
-#if KOOPMPC_AIMED && (!KOOPMPC_DISTURBANCE_WIDTH || KOOPMPC_CHECKED_COUNT > 0)
-/** Coordinates of the nearest target of row k inside its limits; 1 if a limit moved it. */
-static int target_of_row(koopmpc_state *s, int k, const koopmpc_real *e, koopmpc_real *alpha) {
-  const koopmpc_real *row = s->reference + k * KOOPMPC_NR;
-#if KOOPMPC_BOUNDS
-  return koopmpc_target_within(s, row, e, s->target_low + k * KOOPMPC_NL, s->target_high + k * KOOPMPC_NL, alpha);
-#else
-  return koopmpc_target_within(s, row, e, koopmpc_targets_low, koopmpc_targets_high, alpha);
-#endif
-}
-#endif
-
 /* sums and maxima side by side, where a processor does several at once; others lose time with it */
 #if defined(__SSE2__) || defined(_M_X64) || defined(__ARM_NEON) || defined(__aarch64__)
 enum { LANES = 8 };
@@ -120,7 +107,7 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *re
 #if KOOPMPC_DISTURBANCE_WIDTH /* checked when the disturbance is known */
         if (!repeated) koopmpc_nearest(row, 0, nearest);
 #else
-        if ((KOOPMPC_BOUNDS || !repeated) && (moved = target_of_row(s, k, 0, alpha))) {
+        if ((KOOPMPC_BOUNDS || !repeated) && (moved = koopmpc_target_within(s, k, row, 0, alpha))) {
           koopmpc_nearest(row, 0, nearest);
           for (int i = 0; i < KOOPMPC_NA; i++) alpha[i] -= nearest[i];
         }
@@ -193,18 +180,6 @@ static int certain(koopmpc_state *s, koopmpc_real reach) {
 }
 #endif
 
-static void keep(koopmpc_state *s, koopmpc_real *u, koopmpc_report *report, koopmpc_status status) {
-  koopmpc_copy(s->kept, s->t, MOVES);
-  koopmpc_copy(s->given, s->t, KOOPMPC_NU);
-  koopmpc_copy(u, s->t, KOOPMPC_NU);
-#if KOOPMPC_FIRST_ALONE
-  s->owes = 0;
-#endif
-  s->has_kept = s->planned = 1;
-  s->age = 0;
-  report->status = status;
-}
-
 /** Whether a plan that meets all limits is on levels, where its inputs have some. */
 #if KOOPMPC_LEVELS
 static int rests(koopmpc_state *s) { return koopmpc_accept_levels(s); }
@@ -214,13 +189,13 @@ static int rests(const koopmpc_state *s) { return (void)s, 1; }
 
 static void unconstrained(koopmpc_state *s, koopmpc_real *u, koopmpc_report *report) {
   s->warm = 0;
-  keep(s, u, report, KOOPMPC_UNCONSTRAINED);
+  koopmpc_keep(s, s->t, u, report, KOOPMPC_UNCONSTRAINED);
 }
 
 #if KOOPMPC_QP_M > 0
 
-static const koopmpc_qp problem = {MOVES,           ROWS,         KOOPMPC_QP_SOFT, koopmpc_solver_M,
-                                   koopmpc_solver_scaling, 0,            koopmpc_solver_sense,   koopmpc_solver_linear,
+static const koopmpc_qp problem = {MOVES, ROWS, KOOPMPC_QP_SOFT, KOOPMPC_STEEP, koopmpc_solver_M,
+                                   koopmpc_solver_scaling, 0, koopmpc_solver_sense, koopmpc_solver_linear,
                                    koopmpc_solver_rho};
 
 /** The limits of row i of the QP. */
@@ -237,7 +212,7 @@ static koopmpc_real row_high(const koopmpc_state *s, int i) { return (void)s, ko
 #endif
 
 /** Set the limits of a solve: distances from the plan. A rate limit widens if it excludes the input limits. */
-static koopmpc_real set_limits(const koopmpc_state *s, koopmpc_qp_memory *qp, int hard_alone) {
+static koopmpc_real set_limits(const koopmpc_state *s, koopmpc_qp_memory *qp) {
   koopmpc_real conflict = 0;
   for (int i = 0; i < ROWS; i++) {
     qp->low[i] = row_low(s, i);
@@ -258,9 +233,8 @@ static koopmpc_real set_limits(const koopmpc_state *s, koopmpc_qp_memory *qp, in
 #endif
   for (int i = 0; i < ROWS; i++) {
     const koopmpc_real moved = s->t[koopmpc_qp_source[i]] * koopmpc_qp_scale[i];
-    const int off = hard_alone && koopmpc_solver_sense[i];
-    qp->low[i] = off ? -KOOPMPC_HUGE : koopmpc_clip(qp->low[i] - moved, -KOOPMPC_HUGE, KOOPMPC_HUGE) * koopmpc_solver_rows[i];
-    qp->high[i] = off ? KOOPMPC_HUGE : koopmpc_clip(qp->high[i] - moved, -KOOPMPC_HUGE, KOOPMPC_HUGE) * koopmpc_solver_rows[i];
+    qp->low[i] = koopmpc_clip(qp->low[i] - moved, -KOOPMPC_HUGE, KOOPMPC_HUGE) * koopmpc_solver_rows[i];
+    qp->high[i] = koopmpc_clip(qp->high[i] - moved, -KOOPMPC_HUGE, KOOPMPC_HUGE) * koopmpc_solver_rows[i];
   }
   return conflict;
 }
@@ -269,24 +243,11 @@ static koopmpc_real set_limits(const koopmpc_state *s, koopmpc_qp_memory *qp, in
 /** Put the plan on the best sequence of levels; writes how far a limit gave way. */
 static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_report *report) {
   const koopmpc_real opened = koopmpc_open_rates(s);
-  const koopmpc_real conflict = set_limits(s, qp, 0);
+  const koopmpc_real conflict = set_limits(s, qp);
   report->slack = conflict > opened ? conflict : opened;
   return koopmpc_search_levels(s, qp->low, qp->high, report);
 }
 #else
-/** Whether the hard rows alone have no point in common. */
-static int contradictory(koopmpc_state *s, koopmpc_qp_memory *qp) {
-  int good;
-  koopmpc_qp_end end;
-  (void)set_limits(s, qp, 1);
-  end = koopmpc_qp_attempt(&problem, qp, 0, 0, 0, &good);
-  if (!good && end.flag == -1) {
-    (void)set_limits(s, qp, 1);
-    end = koopmpc_qp_attempt(&problem, qp, 0, KOOPMPC_WIDER, 0, &good);
-  }
-  return s->unmet = !good && end.flag == -1;
-}
-
 #if KOOPMPC_STEEP
 /**
  * Solve by proximal points: x <- least 0.5 |x|^2 + 0.5 c |A (x - last)|^2 within the limits, A the hard rows.
@@ -300,13 +261,13 @@ static koopmpc_status approach(koopmpc_state *s, koopmpc_qp_memory *qp, const ko
   koopmpc_real *M = s->eased, *scaling = M + ROWS * MOVES, *linear = scaling + ROWS, *rho = linear + ROWS;
   koopmpc_real *rows = rho + ROWS, weight = (koopmpc_real)1e7, least = 0, missed = KOOPMPC_HUGE, unit = 1;
   koopmpc_real stretch[MOVES], centre[MOVES], pull[MOVES], a[MOVES];
-  const koopmpc_qp eased = {MOVES, ROWS, KOOPMPC_QP_SOFT, M, scaling, 0, koopmpc_solver_sense, linear, rho};
+  const koopmpc_qp eased = {MOVES, ROWS, KOOPMPC_QP_SOFT, 1, M, scaling, 0, koopmpc_solver_sense, linear, rho};
   koopmpc_status status = KOOPMPC_INFEASIBLE;
   int active = 0;
   koopmpc_copy(rows, push, ROWS);
   koopmpc_fill(centre, 0, MOVES);
   for (int pass = 0; pass < PASSES; pass++) {
-    koopmpc_qp_end end = {0, 0};
+    koopmpc_qp_end end;
     unit = 1 + weight;
     for (int j = 0; j < MOVES; j++) {
       stretch[j] = KOOPMPC_SQRT(unit / (1 + weight * koopmpc_solver_lambda[j]));
@@ -323,14 +284,16 @@ static koopmpc_status approach(koopmpc_state *s, koopmpc_qp_memory *qp, const ko
       linear[i] = koopmpc_solver_linear[i] / unit;
       rho[i] = koopmpc_solver_rho[i] * unit;
     }
-    for (int wider = 0; wider < 2 && end.flag <= 0; wider++) {
-      (void)set_limits(s, qp, 0);
-      for (int i = 0; i < ROWS; i++) {
-        const koopmpc_real shift = koopmpc_dot(M + i * MOVES, pull, MOVES) / scaling[i];
-        qp->low[i] += shift;
-        qp->high[i] += shift;
-      }
-      end = koopmpc_qp_solve(&eased, qp, wider ? 0 : rows, wider ? KOOPMPC_WIDER : 0, 0);
+    (void)set_limits(s, qp);
+    for (int i = 0; i < ROWS; i++) {
+      const koopmpc_real shift = koopmpc_dot(M + i * MOVES, pull, MOVES) / scaling[i];
+      qp->low[i] += shift;
+      qp->high[i] += shift;
+    }
+    end = koopmpc_qp_solve(&eased, qp, rows, 0, 0);
+    *iterations += end.iterations;
+    if (end.flag <= 0) {
+      end = koopmpc_qp_solve(&eased, qp, 0, KOOPMPC_WIDER, 0);
       *iterations += end.iterations;
     }
     if (end.flag > 0) {
@@ -358,7 +321,7 @@ static koopmpc_status approach(koopmpc_state *s, koopmpc_qp_memory *qp, const ko
       koopmpc_copy(rows, qp->dual, ROWS);
       if (missed > (koopmpc_real)0.1 * before) weight = weight / 10 > least ? weight / 10 : least;
     } else {
-      status = end.flag == -1 ? KOOPMPC_INFEASIBLE : end.flag == -4 ? KOOPMPC_MAX_ITERATIONS : KOOPMPC_FAILED;
+      status = koopmpc_qp_status(end);
       if (weight > (koopmpc_real)1e9) break;
       least = weight *= 10;
     }
@@ -423,9 +386,8 @@ static void meet_limits(koopmpc_state *s, const koopmpc_real *dual) {
 /** Find the least deviation from the plan inside the limits; writes how far a limit gave way. */
 static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_report *report) {
   koopmpc_real push[KOOPMPC_QP_M1], conflict;
-  koopmpc_qp_end end;
   const int resume = s->warm && s->resumes && lasts(s);
-  koopmpc_status status;
+  koopmpc_status status = KOOPMPC_FAILED;
   int good = 0;
 #if KOOPMPC_SETTINGS_COLD_START
   s->far = s->unmet = 0;
@@ -433,21 +395,17 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
   s->resumes = 0;
   for (int i = 0; i < ROWS; i++) push[i] = resume ? 0 : shifted(s, i);
   const koopmpc_real opened = koopmpc_open_rates(s);
-  if (!resume && s->unmet && contradictory(s, qp)) return KOOPMPC_INFEASIBLE;
-  conflict = set_limits(s, qp, 0);
-  if (!resume && s->far) {
-    status = KOOPMPC_FAILED;
-  } else {
-    end = koopmpc_qp_attempt(&problem, qp, resume ? 0 : push, 0, resume, &good);
+  conflict = set_limits(s, qp);
+  if (!resume && s->unmet) {
+    s->unmet = koopmpc_qp_contradicts(&problem, qp);
+    if (s->unmet) return KOOPMPC_INFEASIBLE;
+  }
+  if (resume || !s->far) {
+    const koopmpc_qp_end end = koopmpc_qp_find(&problem, qp, resume ? 0 : push, resume, &good);
     report->iterations += end.iterations;
-    s->resumes = good;
-    if (end.flag == -1 && KOOPMPC_QP_MIXED && !KOOPMPC_STEEP && contradictory(s, qp)) return KOOPMPC_INFEASIBLE;
-    if (!good && !(end.flag == -1 && KOOPMPC_STEEP)) {
-      (void)set_limits(s, qp, 0);
-      end = koopmpc_qp_attempt(&problem, qp, 0, KOOPMPC_WIDER, 0, &good);
-      report->iterations += end.iterations;
-    }
-    status = end.flag == -1 ? KOOPMPC_INFEASIBLE : end.flag == -4 ? KOOPMPC_MAX_ITERATIONS : KOOPMPC_FAILED;
+    s->resumes = good == 1;
+    s->unmet = qp->hard_alone;
+    status = koopmpc_qp_status(end);
   }
 #if KOOPMPC_STEEP
   if (!good) {
@@ -496,7 +454,7 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
       const int repeated = k > 0 && koopmpc_same(row, row - KOOPMPC_NR, KOOPMPC_NR);
       if (KOOPMPC_BOUNDS || !repeated) {
         koopmpc_nearest(row, e, nearest);
-        target_of_row(s, k, e, alpha);
+        koopmpc_target_within(s, k, row, e, alpha);
         for (int i = 0; i < KOOPMPC_NA; i++) alpha[i] -= nearest[i];
       }
       koopmpc_add(s->t, koopmpc_from_target + k * KOOPMPC_NA * PLANNED, PLANNED, alpha, KOOPMPC_NA);
@@ -519,7 +477,7 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
       return;
     }
 #if KOOPMPC_LEVELS
-    keep(s, u, report, report->gap > 0 ? KOOPMPC_TIME_LIMIT : report->slack > 0 ? KOOPMPC_SOFTENED : KOOPMPC_OPTIMAL);
+    koopmpc_keep(s, s->t, u, report, report->gap > 0 ? KOOPMPC_TIME_LIMIT : report->slack > 0 ? KOOPMPC_SOFTENED : KOOPMPC_OPTIMAL);
     return;
 #else
     koopmpc_add(s->t, koopmpc_deviation, MOVES, qp.primal, MOVES);
@@ -535,7 +493,7 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
 #elif KOOPMPC_HARD_RATES
     koopmpc_admit(s, s->t, koopmpc_hard_rates_low, koopmpc_hard_rates_high, s->known + KOOPMPC_U_PREV);
 #endif
-    keep(s, u, report, report->slack > 0 ? KOOPMPC_SOFTENED : KOOPMPC_OPTIMAL);
+    koopmpc_keep(s, s->t, u, report, report->slack > 0 ? KOOPMPC_SOFTENED : KOOPMPC_OPTIMAL);
 #endif
   }
 #else
@@ -570,16 +528,4 @@ void koopmpc_decide(koopmpc_state *s, const koopmpc_rows *reference, const koopm
     unconstrained(s, u, report);
   else
     limited(s, applied, u, report);
-}
-
-int koopmpc_plan(const koopmpc_state *s, koopmpc_real *U) {
-  koopmpc_real kept[MOVES];
-  if (!s->planned) return 0;
-  koopmpc_copy(kept, s->kept, MOVES);
-#if KOOPMPC_FIRST_ALONE
-  if (s->owes) koopmpc_settle(s, kept);
-#endif
-  for (int k = 0; k < KOOPMPC_N; k++)
-    koopmpc_copy(U + k * KOOPMPC_NU, kept + KOOPMPC_NU * koopmpc_move_of[k], KOOPMPC_NU);
-  return 1;
 }

@@ -20,7 +20,7 @@ void koopmpc_decide(koopmpc_state *s, const koopmpc_rows *reference, const koopm
     koopmpc_real alpha[KOOPMPC_NA + 1], e[KOOPMPC_NZ];
     koopmpc_fill(e, 0, KOOPMPC_NZ);
     if (NW) koopmpc_add(e, koopmpc_model_E, KOOPMPC_NZ, driving, NW);
-    koopmpc_target_within(s, r, NW ? e : 0, koopmpc_targets_low, koopmpc_targets_high, alpha);
+    koopmpc_target_within(s, 0, r, NW ? e : 0, alpha);
     koopmpc_copy(u_r, koopmpc_targets_u0, NU);
     koopmpc_add(u_r, koopmpc_targets_W, NU, alpha, KOOPMPC_NA);
     if (NW) koopmpc_add(u_r, koopmpc_targets_u_disturbance, NU, e, KOOPMPC_NZ);
@@ -41,10 +41,4 @@ void koopmpc_decide(koopmpc_state *s, const koopmpc_rows *reference, const koopm
   for (int i = 0; i < NU; i++) clipped |= u[i] < free_input[i] || u[i] > free_input[i];
   koopmpc_copy(s->given, u, NU);
   report->status = clipped ? KOOPMPC_SATURATED : KOOPMPC_UNCONSTRAINED;
-}
-
-int koopmpc_plan(const koopmpc_state *s, koopmpc_real *U) {
-  (void)s;
-  (void)U;
-  return 0;
 }

@@ -42,11 +42,6 @@ static void deviation(koopmpc_state *s, const koopmpc_real *w) {
   }
 }
 
-static koopmpc_real moved_by(const koopmpc_state *s, int place) {
-  const int k = place / NQ, i = place % NQ;
-  return i < NV ? s->newU[k * NV + i] : koopmpc_dot(s->G + (k * NG + i - NV) * NS, s->newX + k * NS, NS);
-}
-
 /** Rows of length 1, and prices of the soft ones; 0 if the recursion has lost all digits. */
 static int condense(koopmpc_state *s) {
   koopmpc_real w[WIDTH];
@@ -55,7 +50,8 @@ static int condense(koopmpc_state *s) {
     koopmpc_fill(w, 0, WIDTH);
     w[j] = 1;
     deviation(s, w);
-    for (int i = 0; i < COUNT; i++) s->finish_M[i * WIDTH + j] = moved_by(s, koopmpc_finish_row[i]);
+    for (int i = 0; i < COUNT; i++)
+      s->finish_M[i * WIDTH + j] = koopmpc_moved(s, koopmpc_finish_row[i] / NQ, koopmpc_finish_row[i] % NQ, s->newX, s->newU);
   }
   for (int i = 0; i < COUNT; i++) {
     koopmpc_real *row = s->finish_M + i * WIDTH, size = KOOPMPC_SQRT(koopmpc_dot(row, row, WIDTH));
@@ -76,51 +72,30 @@ static int condense(koopmpc_state *s) {
   return good;
 }
 
-/** Set the limits: distances from the plan without limits, in units of the rows. */
-static void room(const koopmpc_state *s, koopmpc_qp_memory *qp, int hard_alone) {
-  for (int r = 0; r < COUNT; r++) {
-    const int k = koopmpc_finish_row[r] / NQ, i = koopmpc_finish_row[r] % NQ, off = hard_alone && koopmpc_finish_sense[r];
-    const koopmpc_real at = s->finish_free[r], size = s->finish_size[r];
-    const koopmpc_real low = koopmpc_low_of(s, k, i) - at, high = koopmpc_high_of(s, k, i) - at;
-    qp->low[r] = off ? -KOOPMPC_HUGE : koopmpc_clip(low / size, -KOOPMPC_HUGE, KOOPMPC_HUGE);
-    qp->high[r] = off ? KOOPMPC_HUGE : koopmpc_clip(high / size, -KOOPMPC_HUGE, KOOPMPC_HUGE);
-  }
-}
-
-static koopmpc_qp_end again(const koopmpc_state *s, const koopmpc_qp *problem, koopmpc_qp_memory *qp,
-                            const koopmpc_real *push, int hard_alone, int wider, int *good) {
-  room(s, qp, hard_alone);
-  return koopmpc_qp_attempt(problem, qp, push, wider ? KOOPMPC_WIDER : 0, 0, good);
-}
-
 koopmpc_status koopmpc_finish(koopmpc_state *s, int *iterations) {
-  const koopmpc_qp problem = {WIDTH,           COUNT, KOOPMPC_FINISH_SOFT,   s->finish_M,     s->finish_scaling, 0,
+  const koopmpc_qp problem = {WIDTH, COUNT, KOOPMPC_FINISH_SOFT, 0, s->finish_M, s->finish_scaling, 0,
                               koopmpc_finish_sense, s->finish_linear, s->finish_rho};
   koopmpc_qp_memory qp = koopmpc_qp_on(&problem, s->finish_reals, s->finish_ints);
   koopmpc_qp_end end;
-  int good = 0, unmet = 0;
+  int good = 0;
   s->spent += FINISHED;
   for (int r = 0; r < COUNT; r++) { /* the program without limits is in newX and newU */
     const int k = koopmpc_finish_row[r] / NQ, i = koopmpc_finish_row[r] % NQ;
-    s->finish_free[r] = moved_by(s, koopmpc_finish_row[r]) + (i < NV ? s->V[k * NV + i] : s->g[k * NG + i - NV]);
+    s->finish_free[r] = koopmpc_moved(s, k, i, s->newX, s->newU) + koopmpc_quantity(s, k, i);
   }
   koopmpc_copy(s->dX, s->newX, STEPS * NS);
   koopmpc_copy(s->dU, s->newU, STEPS * NV);
   if (!condense(s)) return KOOPMPC_FAILED;
   if (!s->finishing) koopmpc_fill(s->finish_dual, 0, COUNT);
   s->finishing = 0;
-  end = again(s, &problem, &qp, s->finish_dual, 0, 0, &good);
+  for (int r = 0; r < COUNT; r++) { /* distances from the plan without limits, in units of the rows */
+    const int k = koopmpc_finish_row[r] / NQ, i = koopmpc_finish_row[r] % NQ;
+    const koopmpc_real at = s->finish_free[r], size = s->finish_size[r];
+    qp.low[r] = koopmpc_clip((koopmpc_low_of(s, k, i) - at) / size, -KOOPMPC_HUGE, KOOPMPC_HUGE);
+    qp.high[r] = koopmpc_clip((koopmpc_high_of(s, k, i) - at) / size, -KOOPMPC_HUGE, KOOPMPC_HUGE);
+  }
+  end = koopmpc_qp_find(&problem, &qp, s->finish_dual, 0, &good);
   *iterations += end.iterations;
-  if (!good && end.flag == -1 && KOOPMPC_FINISH_SOFT > 0 && KOOPMPC_FINISH_SOFT < COUNT) {
-    const koopmpc_qp_end hard = again(s, &problem, &qp, 0, 1, 0, &unmet);
-    unmet = !unmet && hard.flag == -1;
-    if (unmet) unmet = again(s, &problem, &qp, 0, 1, 1, &good).flag == -1 && !good;
-    good = 0;
-  }
-  if (!good && !unmet) {
-    end = again(s, &problem, &qp, 0, 0, 1, &good);
-    *iterations += end.iterations;
-  }
   if (!good)
     return end.flag == -1 && KOOPMPC_HARD_OUTPUTS ? KOOPMPC_INFEASIBLE : KOOPMPC_FAILED;
   koopmpc_copy(s->finish_dual, qp.dual, COUNT);
@@ -129,10 +104,8 @@ koopmpc_status koopmpc_finish(koopmpc_state *s, int *iterations) {
   for (int k = 0; k < STEPS; k++)
     for (int i = 0; i < SOFT; i++) {
       const int row = koopmpc_sides_row[HARD + i];
-      const koopmpc_real moved = moved_by(s, k * NQ + row);
-      const koopmpc_real now = row < NV ? s->V[k * NV + row] + s->dU[k * NV + row]
-                                        : s->g[k * NG + row - NV] +
-                                              koopmpc_dot(s->G + (k * NG + row - NV) * NS, s->dX + k * NS, NS);
+      const koopmpc_real moved = koopmpc_moved(s, k, row, s->newX, s->newU);
+      const koopmpc_real now = koopmpc_quantity(s, k, row) + koopmpc_moved(s, k, row, s->dX, s->dU);
       const koopmpc_real low = koopmpc_low_of(s, k, row), high = koopmpc_high_of(s, k, row);
       const koopmpc_real past = koopmpc_sides_scale[HARD + i] > 0 ? low - now - moved : now + moved - high;
       s->eps[i * STEPS + k] = past > 0 ? past / koopmpc_sides_span[HARD + i] : 0;

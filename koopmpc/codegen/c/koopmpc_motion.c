@@ -87,12 +87,6 @@ static int extend(koopmpc_state *s, int j, int *drifts) {
   return 0;
 }
 
-/** The transpose of a square matrix: of one that stands column after column, its rows. */
-static void transpose(koopmpc_real *to, const koopmpc_real *from, int n) {
-  for (int i = 0; i < n; i++)
-    for (int j = 0; j < n; j++) to[i * n + j] = from[j * n + i];
-}
-
 /** Whether equilibria hold what the rows move through; `by` is d(x, u)/dr and J dof/dx by the sizes of x and u. */
 static int can_drift(const koopmpc_state *s, const koopmpc_real *by, const koopmpc_real *J) {
   koopmpc_real d[RN], x[NX], missed[RN], off[RN], way[RN];
@@ -100,8 +94,8 @@ static int can_drift(const koopmpc_state *s, const koopmpc_real *by, const koopm
   koopmpc_multiply(x, by, d, NX, RN, 1, 0);
   koopmpc_multiply(missed, J, x, RN, NX, 1, 0);
   for (int j = 0; j < RN; j++) missed[j] -= d[j];
-  koopmpc_multiply(off, koopmpc_Q_root, missed, RN, RN, 1, 1);
-  koopmpc_multiply(way, koopmpc_Q_root, d, RN, RN, 1, 1);
+  koopmpc_multiply(off, koopmpc_Q_root, missed, RN, RN, 1, 0);
+  koopmpc_multiply(way, koopmpc_Q_root, d, RN, RN, 1, 0);
   return koopmpc_dot(off, off, RN) <= KOOPMPC_FOLLOWS * KOOPMPC_FOLLOWS * koopmpc_dot(way, way, RN);
 }
 
@@ -111,7 +105,7 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
   koopmpc_real S[GOAL * NX], SA[GOAL * NX], SB[GOAL * NV], R[NV * NV], inner[NV * NV], inverse[NV * NV], gain[NV * NX];
   koopmpc_real K[NV * NX], BK[NX * NX], weighed[RN * NX], push[NX * RN], held[NX * RN], back[NX * GOAL];
   koopmpc_real H[LEAST * NX], T[LEAST * (RN + LEAST)], by[LEAST * RN];
-  koopmpc_real p[NX], next[NX], probe[NX], constant[NX], root_Q[RN * RN], root_R[NV * NV];
+  koopmpc_real p[NX], next[NX], probe[NX], constant[NX], rest_input[NV];
   int moves = 0, drifts = 0, steps = 1;
   for (int j = 0; j < RN; j++) moves |= !stands(s, j);
   if (!moves || !(end[TARGET_FOUND] > 0)) return;
@@ -119,9 +113,8 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
     if (!extend(s, j, &drifts)) return;
   koopmpc_local(end + TARGET_X, end + TARGET_U KOOPMPC_AND(koopmpc_end_w(s)), at);
   koopmpc_factors(at, H, T);
-  transpose(root_Q, koopmpc_rest_weight, RN);
   for (int i = 0; i < LEAST; i++) /* the equilibrium that comes nearest to a row, by its size */
-    koopmpc_multiply(by + i * RN, T + i * (RN + LEAST), root_Q, 1, RN, RN, 0);
+    koopmpc_multiply(by + i * RN, T + i * (RN + LEAST), koopmpc_rest_weight, 1, RN, RN, 0);
   for (int i = 0; i < NX; i++) { /* all by the sizes of x and u */
     for (int j = 0; j < NX; j++) A[i * NX + j] *= sx[j] / sx[i];
     for (int j = 0; j < NV; j++) B[i * NV + j] *= su[j] / sx[i];
@@ -132,8 +125,7 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
   for (int i = 0; i < GOAL * NX; i++) S[i] += end[TARGET_L + i] * sx[i % NX];
   koopmpc_multiply(SA, S, A, GOAL, NX, NX, 0);
   koopmpc_multiply(SB, S, B, GOAL, NX, NV, 0);
-  transpose(root_R, koopmpc_R_root, NV);
-  koopmpc_multiply(R, root_R, root_R, NV, NV, NV, 1);
+  koopmpc_multiply(R, koopmpc_R_root, koopmpc_R_root, NV, NV, NV, 1);
   koopmpc_multiply(inner, SB, SB, NV, GOAL, NV, 1);
   for (int i = 0; i < NV * NV; i++) {
     R[i] *= su[i / NV] * su[i % NV];
@@ -145,19 +137,12 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
   koopmpc_multiply(BK, B, K, NX, NV, NX, 0);
   for (int i = 0; i < NX * NX; i++) A[i] -= BK[i];
   koopmpc_multiply(gain, R, K, NV, NV, NX, 0);
-  transpose(root_Q, koopmpc_Q_root, RN);
-  koopmpc_multiply(weighed, root_Q, J, RN, RN, NX, 0);
-  koopmpc_multiply(push, weighed, root_Q, NX, RN, RN, 1);
-#if KOOPMPC_HOLDS
-  koopmpc_fill(constant, 0, NX);
+  koopmpc_multiply(weighed, koopmpc_Q_root, J, RN, RN, NX, 0);
+  koopmpc_multiply(push, weighed, koopmpc_Q_root, NX, RN, RN, 1);
   koopmpc_multiply(held, gain, by + NX * RN, NX, NV, RN, 1);
-#else
-  koopmpc_real rest_input[NV];
-  for (int i = 0; i < NV; i++) rest_input[i] = end[TARGET_U + i] / su[i];
+  for (int i = 0; i < NV; i++) rest_input[i] = KOOPMPC_HOLDS ? 0 : end[TARGET_U + i] / su[i];
   koopmpc_multiply(constant, gain, rest_input, NX, NV, 1, 1);
-  koopmpc_fill(held, 0, NX * RN);
-#endif
-  for (int i = 0; i < NX * RN; i++) push[i] -= held[i];
+  for (int i = 0; i < NX * RN && KOOPMPC_HOLDS; i++) push[i] -= held[i];
   koopmpc_fill(p, 0, NX);
   koopmpc_fill(probe, 1, NX);
   while (steps < FURTHER + 1) steps *= 2;

@@ -43,7 +43,6 @@ static void remember(koopmpc_state *s, const koopmpc_real *x, const koopmpc_real
     koopmpc_fill(s->z, (koopmpc_real)NAN, KOOPMPC_NZ);
 }
 
-
 #if KOOPMPC_ESTIMATOR == 1 || KOOPMPC_LATENCY > 0 || (KOOPMPC_ESTIMATOR == 0 && KOOPMPC_GATE)
 /** z <- F(z, u) + E w + d; d may be NULL. */
 static void advance(koopmpc_real *next, const koopmpc_real *z, const koopmpc_real *u, const koopmpc_real *w,
@@ -77,12 +76,8 @@ static void show(const koopmpc_real *z, koopmpc_real *states) {
 static void predict(koopmpc_state *s, const koopmpc_real *u, const koopmpc_real *w, koopmpc_real *z,
                     koopmpc_real *expected) {
   advance(z, s->from, u, w, 0);
-#if KOOPMPC_ESTIMATOR
   for (int i = 0; i < KOOPMPC_NZ; i++) s->scratch[i] = z[i] + s->d[i];
   show(s->scratch, expected);
-#else
-  show(z, expected);
-#endif
 }
 #endif
 
@@ -118,20 +113,19 @@ static void predict(koopmpc_state *s, const koopmpc_real *u, const koopmpc_real 
 #endif
 
 #if KOOPMPC_GATE
-/** Whether y is too far from its prediction to be used; NaN in `predicted` is no prediction. */
-static int refuse(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *predicted, int *opened) {
+/** Whether y is too far from its prediction to be used, and with `keep` remember it; NaN in `predicted` is no prediction. */
+static int refuse(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *predicted, int keep, int *opened) {
   koopmpc_real result[KOOPMPC_GATE + 2];
   koopmpc_gate(y, predicted, s->gate, result);
-  koopmpc_copy(s->gate, result + 2, KOOPMPC_GATE);
+  if (keep) koopmpc_copy(s->gate, result + 2, KOOPMPC_GATE);
   *opened = (int)result[1];
   return result[0] > 0;
 }
 
 #if KOOPMPC_NW
-static int is_beyond(const koopmpc_real *memory, const koopmpc_real *y, const koopmpc_real *predicted) {
-  koopmpc_real result[KOOPMPC_GATE + 2];
-  koopmpc_gate(y, predicted, memory, result);
-  return result[0] > 0 || result[1] == 2;
+static int is_beyond(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *predicted) {
+  int opened;
+  return refuse(s, y, predicted, 0, &opened) || opened == 2;
 }
 
 /** Whether w is to be tried against the last one: it is another, and y is not near what it predicts. */
@@ -154,7 +148,7 @@ static void choose(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
     koopmpc_real without[KOOPMPC_NY], moved[KOOPMPC_NY];
     predict(s, u, s->used_w, z, without);
     for (int i = 0; i < KOOPMPC_NY; i++) moved[i] = koopmpc_abs(y[i]) < KOOPMPC_HUGE ? expected[i] : without[i];
-    wild = is_beyond(s->gate, moved, without) && !is_beyond(s->gate, y, without);
+    wild = is_beyond(s, moved, without) && !is_beyond(s, y, without);
     if (wild)
       koopmpc_copy(expected, without, KOOPMPC_NY);
     else
@@ -167,13 +161,12 @@ static void choose(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
 #endif
 }
 
-
 #endif
 
 #if KOOPMPC_GATE && KOOPMPC_ESTIMATOR < 2
 /** from <- z, from which the next reading is predicted; for some missed readings its prediction. */
-static void bridge(koopmpc_state *s, const koopmpc_real *expected) {
-  const int known = koopmpc_usable(s->z, KOOPMPC_NZ), bridges = !known && s->has_z && s->bridged < KOOPMPC_BRIDGED;
+static void bridge(koopmpc_state *s, const koopmpc_real *expected, int known) {
+  const int bridges = !known && s->has_z && s->bridged < KOOPMPC_BRIDGED;
   koopmpc_copy(s->from, bridges ? expected : s->z, KOOPMPC_NZ);
   s->bridged = bridges ? s->bridged + 1 : 0;
   s->has_z = known || bridges;
@@ -237,38 +230,42 @@ void koopmpc_forget(koopmpc_state *s) {
   s->fresh = s->change = 0;
   s->learned = 0;
 }
+#endif
 
-/** Forget the past and all that was learned: the estimate is lost. */
-static void forget_estimate(koopmpc_state *s) {
-  koopmpc_forget(s);
-  s->seen = s->has_z = 0;
-}
-
+#if KOOPMPC_ESTIMATOR < 2
 static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
-  koopmpc_real misfit[KOOPMPC_NZ], expected[KOOPMPC_NY];
-  int opened, learns = s->has_z && !s->stood_in;
+#if KOOPMPC_GATE
+  koopmpc_real ahead[KOOPMPC_NZ], expected[KOOPMPC_NY];
+  int opened, known;
   koopmpc_fill(expected, (koopmpc_real)NAN, KOOPMPC_NY);
-  if (s->has_z) choose(s, y, u, s->w, misfit, expected);
-  s->refused = s->stood_in = refuse(s, y, expected, &opened);
-  if (opened == 2) forget_estimate(s);
+  if (s->has_z) choose(s, y, u, s->w, ahead, expected);
+  s->refused = refuse(s, y, expected, 1, &opened);
+#if KOOPMPC_ESTIMATOR
+  const int learns = s->has_z && !s->stood_in && !s->refused && !opened;
+  if (opened == 2) koopmpc_forget(s);
+#endif
+  if (opened == 2) s->seen = s->has_z = 0; /* the estimate is lost */
   remember(s, s->refused ? expected : y, u);
-  if (!koopmpc_usable(s->z, KOOPMPC_NZ)) { /* the next reading is judged all the same */
-    bridge(s, s->scratch);
-    s->stood_in = 1;
-    return 0;
-  }
-  if (opened == 1) { /* what the readings show now is new: the means begin anew */
+  known = koopmpc_usable(s->z, KOOPMPC_NZ);
+#if KOOPMPC_ESTIMATOR
+  s->stood_in = s->refused || !known; /* the next reading is judged all the same */
+  if (known && opened == 1) { /* what the readings show now is new: the means begin anew */
     s->learned = 0;
     s->fresh = 1;
-  } else if (!opened && learns && !s->refused) {
-    for (int i = 0; i < KOOPMPC_NZ; i++) misfit[i] = s->z[i] - misfit[i];
-    learn(s, misfit);
+  } else if (known && learns) {
+    for (int i = 0; i < KOOPMPC_NZ; i++) ahead[i] = s->z[i] - ahead[i];
+    learn(s, ahead);
   }
-  bridge(s, s->z);
+#endif
+  bridge(s, s->scratch, known);
+  return known || !KOOPMPC_ESTIMATOR;
+#else
+  remember(s, y, u);
   return 1;
+#endif
 }
 
-#elif KOOPMPC_ESTIMATOR == 2
+#else
 /** s <- s + P M' S^-1 (y - M s - h) with the outputs that came; S = M P M' + R in units of its diagonal. */
 static void correct(koopmpc_state *s, const koopmpc_real *y) {
   int came[KOOPMPC_NY], n = 0;
@@ -347,7 +344,7 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
   for (int i = 0; i < KOOPMPC_NY; i++) any |= koopmpc_abs(y[i]) < KOOPMPC_HUGE;
   if (s->queued >= KOOPMPC_ESTIMATOR_DELAY) { /* else y was measured before the start */
     show(s->s, expected);
-    s->refused = refuse(s, y, expected, &opened);
+    s->refused = refuse(s, y, expected, 1, &opened);
     if (opened == 2) begin_again(s, y, u);
     if (any && !s->refused) correct(s, y);
   }
@@ -366,23 +363,6 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
   return s->missed <= KOOPMPC_ESTIMATOR_PATIENCE && largest < KOOPMPC_HUGE;
 }
 
-#else
-static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
-#if KOOPMPC_GATE
-  koopmpc_real next[KOOPMPC_NZ] = {0}, expected[KOOPMPC_NY];
-  int opened;
-  koopmpc_fill(expected, (koopmpc_real)NAN, KOOPMPC_NY);
-  if (s->has_z) choose(s, y, u, s->w, next, expected);
-  s->refused = refuse(s, y, expected, &opened);
-  if (opened == 2) s->seen = s->has_z = 0; /* the estimate is lost */
-  if (s->refused) y = expected;
-#endif
-  remember(s, y, u);
-#if KOOPMPC_GATE
-  bridge(s, next);
-#endif
-  return 1;
-}
 #endif
 
 /** Store the preview of the measured disturbances. */
@@ -433,7 +413,6 @@ void koopmpc_observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real
 #endif
   if (KOOPMPC_ESTIMATOR) koopmpc_copy(s->known + KOOPMPC_DRIFT, s->d, KOOPMPC_NZ);
 }
-
 
 void koopmpc_start_observer(koopmpc_state *s, const koopmpc_real *x0) {
 #if KOOPMPC_ESTIMATOR == 2

@@ -33,6 +33,7 @@ static koopmpc_real *share(koopmpc_real **reals, int n) {
 koopmpc_qp_memory koopmpc_qp_on(const koopmpc_qp *qp, koopmpc_real *reals, int *ints) {
   const int n = qp->n, m = qp->m, k = n + qp->soft + 1;
   koopmpc_qp_memory mem;
+  mem.hard_alone = 0;
   mem.low = share(&reals, m);
   mem.high = share(&reals, m);
   mem.dlow = share(&reals, m);
@@ -57,13 +58,13 @@ koopmpc_qp_memory koopmpc_qp_on(const koopmpc_qp *qp, koopmpc_real *reals, int *
 static int marked(const koopmpc_qp *qp, koopmpc_qp_memory *mem, const koopmpc_real *push, int resume) {
   const int one = DAQP_ACTIVE | DAQP_IMMUTABLE | DAQP_AUTO_EQUALITY;
   int result = 1, narrow = 0, known = 0;
-  for (int i = 0; i < qp->m; i++) narrow |= !(mem->high[i] - mem->low[i] >= KOOPMPC_SETTINGS_ZERO_TOL);
+  for (int i = 0; i < qp->m; i++) narrow |= !(mem->dhigh[i] - mem->dlow[i] >= KOOPMPC_SETTINGS_ZERO_TOL);
   if (resume && !push && !narrow) {
     for (int i = 0; i < qp->m; i++) known |= mem->sense[i];
     if (!(known & DAQP_AUTO_EQUALITY)) return 1;
   }
   for (int i = 0; i < qp->m; i++) {
-    const koopmpc_real width = mem->high[i] - mem->low[i];
+    const koopmpc_real width = mem->dhigh[i] - mem->dlow[i];
     int sense = resume ? mem->sense[i] : qp->sense[i];
     if (push && push[i] > 0) sense |= DAQP_ACTIVE;
     if (push && push[i] < 0) sense |= DAQP_ACTIVE | DAQP_LOWER;
@@ -91,16 +92,19 @@ koopmpc_qp_end koopmpc_qp_solve(const koopmpc_qp *qp, koopmpc_qp_memory *mem, co
 
   for (int j = 0; j < n; j++) mem->primal[j] = mem->u[j] = 0;
   for (int i = 0; i < m; i++) mem->dual[i] = 0;
-  if (wider > 0)
-    for (int i = 0; i < m; i++) {
-      mem->low[i] -= wider * (1 + koopmpc_abs(mem->low[i]));
-      mem->high[i] += wider * (1 + koopmpc_abs(mem->high[i]));
-    }
+  koopmpc_copy(mem->dlow, mem->low, m);
+  koopmpc_copy(mem->dhigh, mem->high, m);
+  for (int i = 0; i < m && wider > 0; i++) {
+    mem->dlow[i] -= wider * (1 + koopmpc_abs(mem->low[i]));
+    mem->dhigh[i] += wider * (1 + koopmpc_abs(mem->high[i]));
+  }
+  for (int i = 0; i < m && mem->hard_alone; i++)
+    if (qp->sense[i]) mem->dlow[i] = -KOOPMPC_HUGE, mem->dhigh[i] = KOOPMPC_HUGE;
   rows = marked(qp, mem, push, resume);
   if (!rows) return end;
   for (int i = 0; i < m; i++) {
-    mem->dlow[i] = mem->low[i] * qp->scaling[i];
-    mem->dhigh[i] = mem->high[i] * qp->scaling[i];
+    mem->dlow[i] *= qp->scaling[i];
+    mem->dhigh[i] *= qp->scaling[i];
   }
   work.settings = &settings;
   work.n = n;
@@ -186,7 +190,8 @@ static int accurate(const koopmpc_qp *problem, const koopmpc_qp_memory *qp) {
   }
   near *= KOOPMPC_ACCURACY;
   for (int i = 0; i < m; i++) {
-    const koopmpc_real over = qp->product[i] - qp->high[i], under = qp->low[i] - qp->product[i];
+    const koopmpc_real over = qp->product[i] - qp->dhigh[i] / problem->scaling[i];
+    const koopmpc_real under = qp->dlow[i] / problem->scaling[i] - qp->product[i];
     const koopmpc_real outside = over > under ? over : under, push = koopmpc_abs(qp->dual[i]);
     if (outside <= near && !(push > 0)) continue;
     if (!problem->sense[i]) {
@@ -203,11 +208,31 @@ static int accurate(const koopmpc_qp *problem, const koopmpc_qp_memory *qp) {
   return 1;
 }
 
-koopmpc_qp_end koopmpc_qp_attempt(const koopmpc_qp *problem, koopmpc_qp_memory *qp, const koopmpc_real *push,
-                                  koopmpc_real wider, int resume, int *good) {
+static koopmpc_qp_end attempt(const koopmpc_qp *problem, koopmpc_qp_memory *qp, const koopmpc_real *push,
+                              koopmpc_real wider, int resume, int *good) {
   const koopmpc_qp_end end = koopmpc_qp_solve(problem, qp, push, wider, resume);
   if (end.flag > 0)
     for (int i = 0; i < problem->m; i++) qp->product[i] /= problem->scaling[i]; /* DAQP's last product M u */
   *good = end.flag == 1 || (end.flag > 1 && accurate(problem, qp));
+  return end;
+}
+
+int koopmpc_qp_contradicts(const koopmpc_qp *qp, koopmpc_qp_memory *mem) {
+  int good, proved;
+  mem->hard_alone = 1;
+  proved = attempt(qp, mem, 0, 0, 0, &good).flag == -1 && !good;
+  if (proved) proved = attempt(qp, mem, 0, KOOPMPC_WIDER, 0, &good).flag == -1 && !good;
+  return mem->hard_alone = proved;
+}
+
+koopmpc_qp_end koopmpc_qp_find(const koopmpc_qp *qp, koopmpc_qp_memory *mem, const koopmpc_real *push, int resume,
+                               int *good) {
+  const koopmpc_qp_end first = attempt(qp, mem, push, 0, resume, good);
+  const int none = first.flag == -1, mixed = qp->soft > 0 && qp->soft < qp->m;
+  koopmpc_qp_end end;
+  if (*good || (none && (qp->doubtful || (mixed && koopmpc_qp_contradicts(qp, mem))))) return first;
+  end = attempt(qp, mem, 0, KOOPMPC_WIDER, 0, good);
+  end.iterations += first.iterations;
+  *good *= 2;
   return end;
 }

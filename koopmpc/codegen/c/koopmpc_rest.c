@@ -27,13 +27,6 @@ enum {
 #define AWAY ((koopmpc_real)2)
 #define LEAST_LENGTH ((koopmpc_real)0.05)
 
-static koopmpc_real largest_of(const koopmpc_real *a, int n) {
-  koopmpc_real most = 0;
-  for (int i = 0; i < n; i++)
-    if (!(koopmpc_abs(a[i]) <= most)) most = koopmpc_abs(a[i]);
-  return most;
-}
-
 /** Turn two columns of n numbers. */
 static void turn(koopmpc_real *left, koopmpc_real *right, koopmpc_real cosine, koopmpc_real sine, int n) {
   for (int i = 0; i < n; i++) {
@@ -96,7 +89,7 @@ static void residuals(const koopmpc_real *at, koopmpc_real *W) {
   for (int i = 0; i < ROWS_R; i++)
     for (int m = 0; m < ROWS_R; m++)
       for (int j = 0; j < NX; j++)
-        W[i * SIZE + j] += koopmpc_rest_weight[m * ROWS_R + i] * at[LOCAL_J + m * NX + j] * koopmpc_rest_size[j];
+        W[i * SIZE + j] += koopmpc_rest_weight[i * ROWS_R + m] * at[LOCAL_J + m * NX + j] * koopmpc_rest_size[j];
   for (int i = 0; i < SIZE; i++) W[(ROWS_R + i) * SIZE + i] = KOOPMPC_SMALL;
 }
 
@@ -113,7 +106,7 @@ static void holding(const koopmpc_real *at, koopmpc_real *E) {
 static void residual(const koopmpc_real *row, const koopmpc_real *of, const koopmpc_real *s, koopmpc_real *left) {
   for (int i = 0; i < ROWS_R; i++) {
     left[i] = 0;
-    for (int j = 0; j < ROWS_R; j++) left[i] += koopmpc_rest_weight[j * ROWS_R + i] * (row[j] - of[j]);
+    for (int j = 0; j < ROWS_R; j++) left[i] += koopmpc_rest_weight[i * ROWS_R + j] * (row[j] - of[j]);
   }
   for (int i = 0; i < SIZE; i++) left[ROWS_R + i] = -KOOPMPC_SMALL * s[i];
 }
@@ -121,7 +114,7 @@ static void residual(const koopmpc_real *row, const koopmpc_real *of, const koop
 /** to = least |W (free to') - left|, to = free to': (SIZE) from left (LEFT); `back` (SIZE, LEFT) is that map. */
 static void least(const koopmpc_real *W, const koopmpc_real *null, int count, koopmpc_real *back) {
   koopmpc_real turned[LEFT * SIZE], inverted[SIZE * LEFT];
-  const koopmpc_real rounding = RANK * largest_of(W, LEFT * SIZE); /* else the residual of the outputs would move inputs along rounding */
+  const koopmpc_real rounding = RANK * koopmpc_largest(W, LEFT * SIZE); /* else the residual of the outputs would move inputs along rounding */
   for (int i = 0; i < LEFT; i++)
     for (int j = 0; j < count; j++) {
       turned[i * count + j] = 0;
@@ -164,9 +157,9 @@ void koopmpc_factors(const koopmpc_real *at, koopmpc_real *H, koopmpc_real *T) {
 static int chord(koopmpc_state *k, koopmpc_real *x, koopmpc_real *u, const koopmpc_real *row, const koopmpc_real *e) {
   koopmpc_real s[SIZE], at[KOOPMPC_LOCAL], left[LEFT], step[SIZE], missed[NX], close, far = 0;
   scaled(x, u, s);
-  close = CLOSE * (1 + largest_of(s, SIZE));
+  close = CLOSE * (1 + koopmpc_largest(s, SIZE));
   koopmpc_local(x, u KOOPMPC_AND(koopmpc_end_w(k)), at);
-  for (int i = 0; i < SIZE; i++) far = koopmpc_abs(s[i] - k->chord_s[i]) > far ? koopmpc_abs(s[i] - k->chord_s[i]) : far;
+  for (int i = 0; i < SIZE; i++) far = koopmpc_most(far, s[i] - k->chord_s[i]);
   if (!k->has_chord || far > close) {
     koopmpc_factors(at, k->chord_H, k->chord_T);
     koopmpc_copy(k->chord_G, at + LOCAL_DG, BOX * NX);
@@ -177,7 +170,7 @@ static int chord(koopmpc_state *k, koopmpc_real *x, koopmpc_real *u, const koopm
   for (int i = 0; i < NX; i++) missed[i] = (at[i] + e[i] - x[i]) / koopmpc_rest_size[i];
   for (int i = 0; i < SIZE; i++)
     step[i] = koopmpc_dot(k->chord_H + i * NX, missed, NX) + koopmpc_dot(k->chord_T + i * LEFT, left, LEFT);
-  if (!(largest_of(step, SIZE) <= close)) return 0;
+  if (!(koopmpc_largest(step, SIZE) <= close)) return 0;
   for (int i = 0; i < LIMITS; i++) {
     koopmpc_real reached;
     if (i < NV) {
@@ -289,7 +282,7 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
       step[i] += taken[i];
     }
     if (!koopmpc_usable(step, SIZE)) return 0;
-    reach = 1 + largest_of(s, SIZE);
+    reach = 1 + koopmpc_largest(s, SIZE);
     for (int i = 0; i < LEFT; i++) pull[i] = left[i] - koopmpc_dot(W + i * SIZE, step, SIZE);
     for (int j = 0; j < SIZE; j++) {
       turned[j] = 0;
@@ -300,7 +293,7 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
       for (int j = 0; j < SIZE; j++) multiplier += gain[j * (NX + n) + NX + i] * turned[j];
       multiplier *= held_now[held[i]];
       pulls[i] = multiplier;
-      if (koopmpc_abs(multiplier) > most_pull) most_pull = koopmpc_abs(multiplier);
+      most_pull = koopmpc_most(most_pull, multiplier);
       if (multiplier < least_pull) {
         least_pull = multiplier;
         release = held[i];
@@ -336,11 +329,9 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
     }
     for (int i = 0; i < SIZE; i++) s[i] += step[i];
     if (length < 1 || length > 1) close = KOOPMPC_HELD; /* steps that swing leave more than their square */
-    if (going && largest_of(whole, SIZE) <= close * reach) {
-      for (int i = 0; i < NX + n; i++) {
-        const koopmpc_real still = koopmpc_abs(koopmpc_dot(kept + i * SIZE, step, SIZE) + missed[i]);
-        if (still > off) off = still;
-      }
+    if (going && koopmpc_largest(whole, SIZE) <= close * reach) {
+      for (int i = 0; i < NX + n; i++)
+        off = koopmpc_most(off, koopmpc_dot(kept + i * SIZE, step, SIZE) + missed[i]);
       if (!(off <= KOOPMPC_HELD * reach)) return 0;
       for (int i = 0; i < NX; i++) x[i] = s[i] * koopmpc_rest_size[i];
       for (int i = 0; i < NV; i++)
@@ -356,10 +347,7 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
 /** Whether an equilibrium at limits is several sizes of the state from that of the row, which meets them. */
 static int is_far(const koopmpc_real *x, const koopmpc_real *active, const koopmpc_real *target) {
   koopmpc_real away = 0;
-  for (int i = 0; i < NX; i++) {
-    const koopmpc_real off = koopmpc_abs(x[i] - target[TARGET_X + i]) / koopmpc_rest_size[i];
-    away = off > away ? off : away;
-  }
+  for (int i = 0; i < NX; i++) away = koopmpc_most(away, (x[i] - target[TARGET_X + i]) / koopmpc_rest_size[i]);
   return koopmpc_is_limited(active) && !koopmpc_is_limited(target + TARGET_ACTIVE) && away > AWAY;
 }
 

@@ -29,7 +29,7 @@ static koopmpc_real apart(const koopmpc_real *a, const koopmpc_real *b) {
   koopmpc_real sum = 0;
   for (int i = 0; i < ROW; i++) {
     koopmpc_real part = 0;
-    for (int j = 0; j < ROW; j++) part += koopmpc_rest_weight[j * ROW + i] * (a[j] - b[j]);
+    for (int j = 0; j < ROW; j++) part += koopmpc_rest_weight[i * ROW + j] * (a[j] - b[j]);
     sum += part * part;
   }
   return sum;
@@ -172,11 +172,8 @@ static const koopmpc_real *make(koopmpc_state *s, const koopmpc_real *row) {
 
 void koopmpc_weigh_row(koopmpc_real *target, const koopmpc_real *root) {
   koopmpc_fill(target + TARGET_M, 0, TARGET_FOUND - TARGET_M);
-  for (int i = 0; i < ROW; i++) {
-    koopmpc_real *M = target + TARGET_M + i * ROW;
-    for (int j = 0; j < ROW; j++) M[j] = root[j * ROW + i];
-    target[TARGET_GOAL + i] = koopmpc_dot(M, target, ROW);
-  }
+  koopmpc_copy(target + TARGET_M, root, ROW * ROW);
+  koopmpc_multiply(target + TARGET_GOAL, root, target, ROW, ROW, 1, 0);
 }
 
 #if KOOPMPC_STAGE_END == 1
@@ -221,14 +218,11 @@ static int sum_tail(const tail_step *t, koopmpc_real *P) {
   koopmpc_fill(last, 0, NV * TAILED);
   for (int i = NX; i < TAILED && KOOPMPC_TAIL_STEPS; i++) koopmpc_fill(P + i * TAILED + NX, 0, TAILED - NX);
   for (int k = 0; k < (KOOPMPC_TAIL_STEPS ? KOOPMPC_TAIL_STEPS : 10 * STEPS); k++) {
-    koopmpc_real moved = 0, most = 0;
+    koopmpc_real moved = 0;
     if (!before(t, P, K)) return 0;
-    for (int i = 0; i < NV * TAILED; i++) {
-      if (koopmpc_abs(K[i] - last[i]) > moved) moved = koopmpc_abs(K[i] - last[i]);
-      if (koopmpc_abs(K[i]) > most) most = koopmpc_abs(K[i]);
-    }
+    for (int i = 0; i < NV * TAILED; i++) moved = koopmpc_most(moved, K[i] - last[i]);
     koopmpc_copy(last, K, NV * TAILED);
-    rested = moved <= KOOPMPC_RESTED * most ? rested + 1 : 0;
+    rested = moved <= KOOPMPC_RESTED * koopmpc_largest(K, NV * TAILED) ? rested + 1 : 0;
     if (!KOOPMPC_TAIL_STEPS && rested >= RESTING) break;
   }
   return 1;
@@ -306,9 +300,9 @@ static int add_tail(koopmpc_real *target, const koopmpc_real *w) {
   koopmpc_multiply(reached, J, back, ROW, NX, ROW, 0);
   for (int i = 0; i < ROW; i++)
     for (int r = 0; r < ROW; r++) {
-      koopmpc_real sum = koopmpc_Q_root[r * ROW + i];
+      koopmpc_real sum = koopmpc_Q_root[i * ROW + r];
       for (int b = 0; b < ROW; b++)
-        sum -= koopmpc_Q_root[b * ROW + i] * koopmpc_tail_row_size[b] * reached[b * ROW + r] / koopmpc_tail_row_size[r];
+        sum -= koopmpc_Q_root[i * ROW + b] * koopmpc_tail_row_size[b] * reached[b * ROW + r] / koopmpc_tail_row_size[r];
       M[(TAILED + i) * ROW + r] = mean * sum;
     }
   for (int i = 0; i < KOOPMPC_GOAL; i++)

@@ -20,58 +20,50 @@ enum { EACH = 12, AGAIN = 10, ENDINGS = 20, SPENT = 300, PLAN_S = (STEPS + 1) * 
 
 static int is_good(koopmpc_status status) { return status <= KOOPMPC_SOFTENED; }
 
-static koopmpc_real most_of(koopmpc_real most, koopmpc_real value) {
-  value = koopmpc_abs(value);
-  return value <= most ? most : value; /* NaN stays */
+/** Input i of stage k inside its limits. */
+static koopmpc_real clip_input(const koopmpc_state *s, int k, int i, koopmpc_real u) {
+  (void)s, (void)k; /* where no limit moves */
+  return koopmpc_clip(u, KOOPMPC_STAGE_BOX_LOW(s, k)[i], KOOPMPC_STAGE_BOX_HIGH(s, k)[i]);
 }
 
 /** Write states X (N+1, nx) and inputs U (N, nu) as the plan: inputs inside their limits and held in each block. */
 static void enter(koopmpc_state *s, const koopmpc_real *X, const koopmpc_real *U, const koopmpc_real *u_prev) {
-  for (int k = STEPS; k >= 0; k--) {
-    for (int i = NX - 1; i >= 0; i--) s->S[k * NS + i] = X[k * NX + i];
-  }
+  for (int k = 0; k <= STEPS; k++) koopmpc_copy(s->S + k * NS, X + k * NX, NX);
+  for (int i = 0; i < NV && KOOPMPC_WITH_RATES; i++) s->S[NX + i] = u_prev[i];
   for (int k = 0; k < STEPS; k++)
     for (int i = 0; i < NV; i++) {
-      const koopmpc_real least = KOOPMPC_STAGE_BOX_LOW(s, k)[i], most = KOOPMPC_STAGE_BOX_HIGH(s, k)[i];
-#if KOOPMPC_WITH_RATES
-      const koopmpc_real u = koopmpc_clip(U[koopmpc_held_from[k] * NV + i], least, most);
-      koopmpc_real *before = s->S + k * NS + NX;
-      if (k == 0) before[i] = u_prev[i];
-      before[NS + i] = u;
-      s->V[k * NV + i] = u - before[i];
-#else
-      s->V[k * NV + i] = koopmpc_clip(U[k * NV + i], least, most);
-#endif
+      const int from = KOOPMPC_WITH_RATES ? koopmpc_held_from[k] : k;
+      const koopmpc_real u = clip_input(s, k, i, U[from * NV + i]);
+      s->V[k * NV + i] = KOOPMPC_WITH_RATES ? u - s->S[k * NS + NX + i] : u;
+      if (KOOPMPC_WITH_RATES) s->S[(k + 1) * NS + NX + i] = u;
     }
   for (int k = 0; k <= STEPS; k++)
     for (int i = 0; i < KOOPMPC_SOFT_RATES_LENGTH; i++)
       s->S[k * NS + NX + NV + i] = k ? s->V[(k - 1) * NV + koopmpc_soft_rates[i]] : 0;
-  (void)u_prev;
 }
 
 /** Write the states and the inputs of the plan, the inputs inside their limits. */
 static void trajectory(const koopmpc_state *s, koopmpc_real *X, koopmpc_real *U) {
   for (int k = 0; k <= STEPS; k++) koopmpc_copy(X + k * NX, s->S + k * NS, NX);
   for (int i = 0; i < NV; i++) {
-#if KOOPMPC_WITH_RATES
-    koopmpc_real u = s->S[NX + i];
+    koopmpc_real u = KOOPMPC_WITH_RATES ? s->S[NX + i] : 0;
     for (int k = 0; k < STEPS; k++) {
-      if (koopmpc_free[k]) u += s->V[k * NV + i];
-      U[k * NV + i] = koopmpc_clip(u, KOOPMPC_STAGE_BOX_LOW(s, k)[i], KOOPMPC_STAGE_BOX_HIGH(s, k)[i]);
+      const koopmpc_real v = s->V[k * NV + i];
+      u = !KOOPMPC_WITH_RATES ? v : koopmpc_free[k] ? u + v : u;
+      U[k * NV + i] = clip_input(s, k, i, u);
     }
-#else
-    for (int k = 0; k < STEPS; k++)
-      U[k * NV + i] =
-          koopmpc_clip(s->V[k * NV + i], KOOPMPC_STAGE_BOX_LOW(s, k)[i], KOOPMPC_STAGE_BOX_HIGH(s, k)[i]);
-#endif
   }
+}
+
+/** Add the disturbance of step k of the plan to x. */
+static void push(const koopmpc_state *s, int k, koopmpc_real *x) {
+  for (int i = 0; i < NX && KOOPMPC_DISTURBED; i++) x[i] += s->e[k * NX + i];
 }
 
 /** One step of the model from a stage, with the disturbance of the plan. */
 static void follow(const koopmpc_state *s, int k, const koopmpc_real *x, const koopmpc_real *v, koopmpc_real *next) {
   koopmpc_stage_map(x, v KOOPMPC_AND(koopmpc_w_of(s, k)), next);
-  if (KOOPMPC_DISTURBED)
-    for (int i = 0; i < NX; i++) next[i] += s->e[k * NX + i];
+  push(s, k, next);
 }
 
 /** Add the step to the plan: all of it, or the half, quarter, ... along which F is near its linearisation. */
@@ -83,9 +75,9 @@ static void add_program(koopmpc_state *s, const koopmpc_real *x) {
     koopmpc_real change = 0, size = 0;
     gap[i] = 0;
     for (int k = 0; k < STEPS; k++) {
-      gap[i] = most_of(gap[i], left[k * NS + i]);
-      change = most_of(change, s->dX[k * NS + i]);
-      size = most_of(size, s->S[(k + 1) * NS + i]);
+      gap[i] = koopmpc_most(gap[i], left[k * NS + i]);
+      change = koopmpc_most(change, s->dX[k * NS + i]);
+      size = koopmpc_most(size, s->S[(k + 1) * NS + i]);
     }
     reach[i] = NEAR_OF * (change > gap[i] ? change : gap[i]) + KOOPMPC_REACH * (koopmpc_stage_sizes[i] + size);
   }
@@ -103,7 +95,7 @@ static void add_program(koopmpc_state *s, const koopmpc_real *x) {
       follow(s, k, before, u, found);
       for (int i = 0; i < NS; i++) {
         const koopmpc_real off = found[i] - next[i];
-        error[i] = most_of(error[i], off);
+        error[i] = koopmpc_most(error[i], off);
         fits &= koopmpc_abs(off - (1 - length) * left[k * NS + i]) <= length * reach[i];
       }
       koopmpc_copy(before, next, NS);
@@ -138,7 +130,7 @@ static koopmpc_real gap_of(const koopmpc_state *s) {
       if (s->S[k * NS + i] < low) low = s->S[k * NS + i];
       if (s->S[k * NS + i] > high) high = s->S[k * NS + i];
     }
-    most = most_of(most, s->defects[i] / (high - low + KOOPMPC_REACH * (koopmpc_stage_sizes[i] + koopmpc_abs(s->S[i]))));
+    most = koopmpc_most(most, s->defects[i] / (high - low + KOOPMPC_REACH * (koopmpc_stage_sizes[i] + koopmpc_abs(s->S[i]))));
   }
   return most;
 }
@@ -148,13 +140,13 @@ static int rests(const koopmpc_state *s, koopmpc_real settled) {
   koopmpc_real moved = 0, size = 0, plan = 0, input = 0;
   for (int k = 0; k <= STEPS; k++)
     for (int i = 0; i < NS; i++) {
-      if (k) moved = most_of(moved, s->dX[(k - 1) * NS + i] / koopmpc_stage_sizes[i]);
-      size = most_of(size, s->S[k * NS + i] / koopmpc_stage_sizes[i]);
+      if (k) moved = koopmpc_most(moved, s->dX[(k - 1) * NS + i] / koopmpc_stage_sizes[i]);
+      size = koopmpc_most(size, s->S[k * NS + i] / koopmpc_stage_sizes[i]);
     }
   for (int k = 0; k < STEPS; k++)
     for (int i = 0; i < NV; i++) {
-      input = most_of(input, s->dU[k * NV + i] / koopmpc_input_sizes[i]);
-      plan = most_of(plan, s->V[k * NV + i] / koopmpc_input_sizes[i]);
+      input = koopmpc_most(input, s->dU[k * NV + i] / koopmpc_input_sizes[i]);
+      plan = koopmpc_most(plan, s->V[k * NV + i] / koopmpc_input_sizes[i]);
     }
   return moved <= settled * (1 + size) && input <= settled * (1 + plan);
 }
@@ -186,18 +178,20 @@ static void shift(koopmpc_state *s, const koopmpc_real *u_prev) {
   for (int i = 0; i < STEPS * NX; i++) X[i] = X[i + NX];
   for (int i = 0; i < (STEPS - 1) * NV; i++) U[i] = U[i + NV];
   koopmpc_map(X + (STEPS - 1) * NX, U + (STEPS - 1) * NV KOOPMPC_AND(koopmpc_w_of(s, STEPS - 1)), X + STEPS * NX);
-  if (KOOPMPC_DISTURBED)
-    for (int i = 0; i < NX; i++) X[STEPS * NX + i] += s->e[(STEPS - 1) * NX + i];
+  push(s, STEPS - 1, X + STEPS * NX);
   enter(s, X, U, u_prev);
+}
+
+/** Write u = 0, or u_prev where its changes count, inside the limits. */
+static void hold(const koopmpc_real *u_prev, koopmpc_real *u) {
+  for (int i = 0; i < NV; i++)
+    u[i] = koopmpc_clip(KOOPMPC_WITH_RATES ? u_prev[i] : 0, koopmpc_inputs_low[i], koopmpc_inputs_high[i]);
 }
 
 /** Write start `which` as the plan: rest at x, the line from x to the equilibrium, the motion from x; 0 if it leaves. */
 static int begin(koopmpc_state *s, int which, const koopmpc_real *x, const koopmpc_real *u_prev) {
   koopmpc_real *X = s->draftX, *U = s->draftU;
-  for (int k = 0; k < STEPS; k++)
-    for (int i = 0; i < NV; i++)
-      U[k * NV + i] =
-          koopmpc_clip(KOOPMPC_WITH_RATES ? u_prev[i] : 0, koopmpc_inputs_low[i], koopmpc_inputs_high[i]);
+  for (int k = 0; k < STEPS; k++) hold(u_prev, U + k * NV);
   for (int k = 0; k <= STEPS; k++)
     for (int i = 0; i < NX; i++) {
       const koopmpc_real share = (koopmpc_real)k / (koopmpc_real)STEPS;
@@ -206,8 +200,7 @@ static int begin(koopmpc_state *s, int which, const koopmpc_real *x, const koopm
   if (which == 2) {
     for (int k = 0; k < STEPS; k++) {
       koopmpc_map(X + k * NX, U + k * NV KOOPMPC_AND(koopmpc_w_of(s, k)), X + (k + 1) * NX);
-      if (KOOPMPC_DISTURBED)
-        for (int i = 0; i < NX; i++) X[(k + 1) * NX + i] += s->e[k * NX + i];
+      push(s, k, X + (k + 1) * NX);
     }
     if (!koopmpc_usable(X, (STEPS + 1) * NX)) return 0;
   }
@@ -219,8 +212,7 @@ static int begin(koopmpc_state *s, int which, const koopmpc_real *x, const koopm
 static int runs_away(const koopmpc_state *s, const koopmpc_real *x, const koopmpc_real *u_prev) {
   koopmpc_real at[NX], next[NX], u[NV];
   koopmpc_copy(at, x, NX);
-  for (int i = 0; i < NV; i++)
-    u[i] = koopmpc_clip(KOOPMPC_WITH_RATES ? u_prev[i] : 0, koopmpc_inputs_low[i], koopmpc_inputs_high[i]);
+  hold(u_prev, u);
   for (int k = 0; k <= STEPS; k++) {
     for (int i = 0; i < NX; i++)
       if (koopmpc_abs(at[i]) >= KOOPMPC_NO_DIGITS * koopmpc_stage_sizes[i]) return 1; /* not for NaN */
@@ -248,7 +240,6 @@ static void restore(koopmpc_state *s) {
   s->slack = s->best_slack;
 }
 
-#if KOOPMPC_HARD_OUTPUTS
 /** By how much the state after stage k breaks a hard limit, in units of what counts as broken; at least `past`. */
 static koopmpc_real past_of(const koopmpc_state *s, int k, const koopmpc_real *next, koopmpc_real past) {
   koopmpc_real outputs[NG + NG * NS + 1];
@@ -283,12 +274,11 @@ static koopmpc_real excess_of(koopmpc_state *s) {
 static koopmpc_status meet_limits(koopmpc_state *s, koopmpc_status status, const koopmpc_real *x,
                                   const koopmpc_real *u_prev, int *iterations) {
   for (int k = 0; k < ENDINGS; k++) {
-    if (!is_good(status) || excess_of(s) <= 1) return status;
+    if (!KOOPMPC_HARD_OUTPUTS || !is_good(status) || excess_of(s) <= 1) return status;
     status = improve(s, x, u_prev, 1, KOOPMPC_SETTLED, 0, iterations);
   }
   return !is_good(status) || excess_of(s) <= 1 ? status : KOOPMPC_MAX_ITERATIONS;
 }
-#endif
 
 /** Choose the cheapest plan of several starts; plans that follow the model come first. */
 static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const koopmpc_real *u_prev,
@@ -307,11 +297,7 @@ static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const 
     ended = improve(s, x, u_prev, EACH, NEARLY, until, iterations);
     if (is_good(ended)) {
       const koopmpc_real gap = gap_of(s);
-#if KOOPMPC_HARD_OUTPUTS
-      const koopmpc_real excess = BROKEN * excess_of(s);
-#else
-      const koopmpc_real excess = 0;
-#endif
+      const koopmpc_real excess = KOOPMPC_HARD_OUTPUTS ? BROKEN * excess_of(s) : 0;
       kind = gap < FOLLOWED && excess <= FOLLOWED ? 0 : 1;
       value = kind == 0 ? koopmpc_cost(s) : gap > excess ? gap : excess;
     }
@@ -469,7 +455,7 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference) {
 #if KOOPMPC_WITH_RATES
   for (int i = 0; i < NV; i++) {
     koopmpc_real *row = s->end_L + (KOOPMPC_GOAL + i) * NS + NX;
-    for (int j = 0; j < NV; j++) row[j] = koopmpc_R_root[j * NV + i];
+    koopmpc_copy(row, koopmpc_R_root + i * NV, NV);
     s->end_m[KOOPMPC_GOAL + i] = koopmpc_dot(row, s->u_r + (STEPS - 1) * NV, NV);
   }
 #endif
@@ -517,16 +503,12 @@ static koopmpc_status solve(koopmpc_state *s, const koopmpc_real *stage, const k
     if (near) {
       shift(s, u_prev);
       status = improve(s, stage, u_prev, KOOPMPC_ITERATIONS, KOOPMPC_SETTLED, SPENT, iterations);
-#if KOOPMPC_HARD_OUTPUTS
       status = meet_limits(s, status, stage, u_prev, iterations);
-#endif
     }
   }
   if (!is_good(status)) {
     status = begin_anew(s, stage, u_prev, iterations);
-#if KOOPMPC_HARD_OUTPUTS
     status = meet_limits(s, status, stage, u_prev, iterations);
-#endif
   }
   return status;
 }
@@ -598,16 +580,7 @@ void koopmpc_decide(koopmpc_state *s, const koopmpc_rows *reference, const koopm
   } else {
     conflict = 0;
   }
-  s->has_kept = s->planned = 1;
-  s->age = 0;
-  koopmpc_copy(s->given, s->kept, NV);
-  koopmpc_copy(u, s->kept, NV);
-  report->status = conflict ? KOOPMPC_SOFTENED : status;
-}
-
-int koopmpc_plan(const koopmpc_state *s, koopmpc_real *U) {
-  if (s->planned) koopmpc_copy(U, s->kept, STEPS * NV);
-  return s->planned;
+  koopmpc_keep(s, s->kept, u, report, conflict ? KOOPMPC_SOFTENED : status);
 }
 
 int koopmpc_plan_states(const koopmpc_state *s, koopmpc_real *X) {

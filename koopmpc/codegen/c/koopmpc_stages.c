@@ -15,11 +15,6 @@ enum { STALLED = 5 }; /* a step is centred if mu has not halved in this many ste
 #define CENTRING ((koopmpc_real)0.3)
 #define SHORT_OF ((koopmpc_real)0.995)
 
-/** [v_k; g_k] of the plan. */
-static koopmpc_real quantity(const koopmpc_state *s, int k, int i) {
-  return i < NV ? s->V[k * NV + i] : s->g[k * NG + i - NV];
-}
-
 koopmpc_real koopmpc_low_of(const koopmpc_state *s, int k, int i) {
   return KOOPMPC_WITH_RATES && k == 0 && i < NV ? s->first_low[i] : KOOPMPC_PLAN_LOW(s)[i * STEPS + k];
 }
@@ -180,11 +175,6 @@ static void sweep(koopmpc_state *s, const koopmpc_real *push) {
   }
 }
 
-/** How far g(s_{k+1}) moves under a step dx: row g of G. */
-static koopmpc_real reached(const koopmpc_state *s, int k, int i, const koopmpc_real *X, const koopmpc_real *U) {
-  return i < NV ? U[k * NV + i] : koopmpc_dot(s->G + (k * NG + i - NV) * NS, X + k * NS, NS);
-}
-
 #if KOOPMPC_SIDES > 0
 
 /** Pairs of a limit stand side after side, each over all stages, so that a compiler vectorises the loops. */
@@ -193,7 +183,7 @@ enum { PAIRS = SIDES * STEPS, EASED = SOFT * STEPS };
 /** How far the quantities that have limits move under a step, one after the other over all stages. */
 static void reach_of(koopmpc_state *s, const koopmpc_real *X, const koopmpc_real *U) {
   for (int k = 0; k < STEPS; k++)
-    for (int i = 0; i < NQ; i++) s->reach[i * STEPS + k] = reached(s, k, i, X, U);
+    for (int i = 0; i < NQ; i++) s->reach[i * STEPS + k] = koopmpc_moved(s, k, i, X, U);
 }
 
 /** The pull of a soft side's row beside its multiplier, and the part of its slack in it. */
@@ -345,7 +335,6 @@ static koopmpc_real unit_of(const koopmpc_state *s) {
   return larger(sum, (koopmpc_real)1e-30);
 }
 
-#if KOOPMPC_HARD_OUTPUTS
 /** Whether no first input inside its limits leads to a state inside its hard limits, row by row, as after wild readings. */
 static int hard_limits_are_out_of_reach(const koopmpc_state *s) {
   koopmpc_real next[NS];
@@ -369,7 +358,6 @@ static int hard_limits_are_out_of_reach(const koopmpc_state *s) {
   }
   return 0;
 }
-#endif
 
 /** Follow the central path from the unconstrained solution. */
 static koopmpc_status limited(koopmpc_state *s, int *iterations) {
@@ -379,9 +367,7 @@ static koopmpc_status limited(koopmpc_state *s, int *iterations) {
   for (int i = 0; i < HARD; i++) /* between two equal limits there is no interior point */
     for (int k = 0; k < STEPS; k++)
       narrow |= !(koopmpc_low_of(s, k, koopmpc_sides_row[i]) < koopmpc_high_of(s, k, koopmpc_sides_row[i]));
-#if KOOPMPC_HARD_OUTPUTS
-  if (hard_limits_are_out_of_reach(s)) return KOOPMPC_INFEASIBLE;
-#endif
+  if (KOOPMPC_HARD_OUTPUTS && hard_limits_are_out_of_reach(s)) return KOOPMPC_INFEASIBLE;
   if (s->finishing || narrow) return koopmpc_finish(s, iterations);
   koopmpc_fill(s->step_t, 0, PAIRS);
   koopmpc_fill(s->step_lam, 0, PAIRS);
@@ -391,8 +377,8 @@ static koopmpc_status limited(koopmpc_state *s, int *iterations) {
     for (int i = 0; i < SIDES; i++) {
       const int at = i * STEPS + k, row = koopmpc_sides_row[i], up = koopmpc_sides_scale[i] > 0;
       const koopmpc_real end = up ? koopmpc_low_of(s, k, row) : koopmpc_high_of(s, k, row);
-      s->d_side[at] = koopmpc_sides_scale[i] * (quantity(s, k, row) - end);
-      s->t[at] = koopmpc_sides_scale[i] * (quantity(s, k, row) + reached(s, k, row, s->dX, s->dU) - end);
+      s->d_side[at] = koopmpc_sides_scale[i] * (koopmpc_quantity(s, k, row) - end);
+      s->t[at] = koopmpc_sides_scale[i] * (koopmpc_quantity(s, k, row) + koopmpc_moved(s, k, row, s->dX, s->dU) - end);
       if (s->t[at] < least) least = s->t[at];
     }
   worst = larger(-least, (koopmpc_real)1e-3);
@@ -459,7 +445,7 @@ koopmpc_status koopmpc_program(koopmpc_state *s, const koopmpc_real *x, koopmpc_
   good = koopmpc_usable(s->dX, STEPS * NS) && koopmpc_usable(s->dU, STEPS * NV);
   for (int k = 0; k < STEPS && inside; k++)
     for (int i = 0; i < NQ; i++) {
-      const koopmpc_real value = quantity(s, k, i) + reached(s, k, i, s->dX, s->dU);
+      const koopmpc_real value = koopmpc_quantity(s, k, i) + koopmpc_moved(s, k, i, s->dX, s->dU);
       inside &= value >= koopmpc_low_of(s, k, i) && value <= koopmpc_high_of(s, k, i);
     }
   koopmpc_fill(s->eps, 0, STEPS * SOFT);

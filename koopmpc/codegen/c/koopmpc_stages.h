@@ -56,6 +56,19 @@ static inline void koopmpc_multiply(koopmpc_real *to, const koopmpc_real *a, con
     }
 }
 
+/** The larger of `most` and |value|; NaN stays. */
+static inline koopmpc_real koopmpc_most(koopmpc_real most, koopmpc_real value) {
+  value = koopmpc_abs(value);
+  return value <= most ? most : value;
+}
+
+/** The largest of |a|. */
+static inline koopmpc_real koopmpc_largest(const koopmpc_real *a, int n) {
+  koopmpc_real most = 0;
+  for (int i = 0; i < n; i++) most = koopmpc_most(most, a[i]);
+  return most;
+}
+
 /** K (n, m) <- H^-1 K by the lower factor of H, which is written to L; 0 if H is not positive definite. */
 static inline int koopmpc_divide(const koopmpc_real *H, koopmpc_real *L, koopmpc_real *K, int n, int m) {
   int good = 1;
@@ -108,14 +121,21 @@ void koopmpc_stage(const koopmpc_real *s, const koopmpc_real *r, koopmpc_real *o
 /** F, A, B, of, J, g and G at (x, u), for the search of an equilibrium. */
 void koopmpc_local(const koopmpc_real *x, const koopmpc_real *u KOOPMPC_AND(const koopmpc_real *w), koopmpc_real *out);
 
-#if KOOPMPC_HARD_OUTPUTS
 /** Whether a limited output is hard; the first ones are inputs where their changes count. */
 static inline int koopmpc_is_hard(int row) {
   return row >= KOOPMPC_NU * KOOPMPC_WITH_RATES && !(koopmpc_softness_linear[row] < KOOPMPC_HUGE);
 }
-#endif
 
-/** The lower and the upper limit of entry i of [v_k; g(s_{k+1})]. */
+/** Entry i of [v_k; g(s_{k+1})] of the plan, and how far a step moves it. */
+static inline koopmpc_real koopmpc_quantity(const koopmpc_state *s, int k, int i) {
+  return i < NV ? s->V[k * NV + i] : s->g[k * NG + i - NV];
+}
+static inline koopmpc_real koopmpc_moved(const koopmpc_state *s, int k, int i, const koopmpc_real *X,
+                                         const koopmpc_real *U) {
+  return i < NV ? U[k * NV + i] : koopmpc_dot(s->G + (k * NG + i - NV) * NS, X + k * NS, NS);
+}
+
+/** The lower and the upper limit of that entry. */
 koopmpc_real koopmpc_low_of(const koopmpc_state *s, int k, int i);
 koopmpc_real koopmpc_high_of(const koopmpc_state *s, int k, int i);
 

@@ -84,6 +84,30 @@ void koopmpc_fail(koopmpc_state *s, const koopmpc_real *free_input, const koopmp
   koopmpc_copy(s->given, u, KOOPMPC_NU);
 }
 
+void koopmpc_keep(koopmpc_state *s, const koopmpc_real *plan, koopmpc_real *u, koopmpc_report *report,
+                  koopmpc_status status) {
+  koopmpc_copy(s->kept, plan, KOOPMPC_MOVES);
+  koopmpc_copy(s->given, plan, KOOPMPC_NU);
+  koopmpc_copy(u, plan, KOOPMPC_NU);
+#if KOOPMPC_FIRST_ALONE
+  s->owes = 0;
+#endif
+  s->has_kept = s->planned = 1;
+  s->age = 0;
+  report->status = status;
+}
+
+int koopmpc_plan(const koopmpc_state *s, koopmpc_real *U) {
+  koopmpc_real kept[KOOPMPC_MOVES];
+  if (!s->planned) return 0;
+  koopmpc_copy(kept, s->kept, KOOPMPC_MOVES);
+#if KOOPMPC_FIRST_ALONE
+  if (s->owes) koopmpc_settle(s, kept);
+#endif
+  for (int k = 0; k < KOOPMPC_N; k++) koopmpc_copy(U + k * KOOPMPC_NU, kept + KOOPMPC_NU * MOVE_OF(k), KOOPMPC_NU);
+  return 1;
+}
+
 void koopmpc_admit(const koopmpc_state *s, koopmpc_real *u, const koopmpc_real *low, const koopmpc_real *high,
                    const koopmpc_real *last) {
   (void)s;

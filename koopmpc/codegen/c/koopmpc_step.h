@@ -89,6 +89,10 @@ void koopmpc_settle(const koopmpc_state *s, koopmpc_real *kept);
 void koopmpc_give_input(const koopmpc_state *s, int k, koopmpc_real *u);
 #endif
 
+/** Keep a plan, and take its first input. */
+void koopmpc_keep(koopmpc_state *s, const koopmpc_real *plan, koopmpc_real *u, koopmpc_report *report,
+                  koopmpc_status status);
+
 /** Write the fallback of a failed step; `free_input` is the unconstrained optimum, NULL if it is not known. */
 void koopmpc_fail(koopmpc_state *s, const koopmpc_real *free_input, const koopmpc_real *applied, koopmpc_real *u,
                   koopmpc_report *report, koopmpc_status status);
@@ -100,9 +104,8 @@ void koopmpc_admit(const koopmpc_state *s, koopmpc_real *u, const koopmpc_real *
 /** Coordinates of the target nearest to r, without limits; disturbances add e to z, NULL for none. */
 void koopmpc_nearest(const koopmpc_real *r, const koopmpc_real *e, koopmpc_real *alpha);
 
-/** The same inside the limits `least` and `most` of KOOPMPC_NL values. */
-int koopmpc_target_within(koopmpc_state *s, const koopmpc_real *r, const koopmpc_real *e, const koopmpc_real *least,
-                          const koopmpc_real *most, koopmpc_real *alpha);
+/** The same inside the limits of row k; 1 if they moved it. */
+int koopmpc_target_within(koopmpc_state *s, int k, const koopmpc_real *r, const koopmpc_real *e, koopmpc_real *alpha);
 
 /** The limits of a step: those that move in time, or those of the controller. */
 #if KOOPMPC_BOUNDS
@@ -112,6 +115,8 @@ int koopmpc_target_within(koopmpc_state *s, const koopmpc_real *r, const koopmpc
 #define KOOPMPC_BOX_HIGH(s) (s)->box_high
 #define KOOPMPC_STAGE_BOX_LOW(s, k) ((s)->box_low + (k) * KOOPMPC_NU)
 #define KOOPMPC_STAGE_BOX_HIGH(s, k) ((s)->box_high + (k) * KOOPMPC_NU)
+#define KOOPMPC_TARGET_LOW(s, k) ((s)->target_low + (k) * KOOPMPC_NL)
+#define KOOPMPC_TARGET_HIGH(s, k) ((s)->target_high + (k) * KOOPMPC_NL)
 
 /** Take the limits of the controller itself. */
 void koopmpc_reset_bounds(koopmpc_state *s);
@@ -132,6 +137,8 @@ static inline koopmpc_real koopmpc_bound_of(const koopmpc_rows *rows, int k, int
 #define KOOPMPC_BOX_HIGH(s) koopmpc_inputs_high
 #define KOOPMPC_STAGE_BOX_LOW(s, k) koopmpc_inputs_low
 #define KOOPMPC_STAGE_BOX_HIGH(s, k) koopmpc_inputs_high
+#define KOOPMPC_TARGET_LOW(s, k) koopmpc_targets_low
+#define KOOPMPC_TARGET_HIGH(s, k) koopmpc_targets_high
 #endif
 
 #if KOOPMPC_BOUNDS && !KOOPMPC_IS_STAGED
@@ -173,6 +180,7 @@ koopmpc_status koopmpc_search_levels(koopmpc_state *s, const koopmpc_real *low, 
 /** Least 0.5 |v|^2 with low <= M v / scaling <= high, v = R x: rows of M have length 1. */
 typedef struct {
   int n, m, soft;              /**< variables, rows, and how many rows may give way */
+  int doubtful;                /**< whether rows may be so nearly dependent that no solution found proves nothing */
   const koopmpc_real *M;       /**< (m, n) */
   const koopmpc_real *scaling; /**< (m) */
   const koopmpc_real *rinv;    /**< inverse of R, its upper triangle row by row; NULL for the identity */
@@ -183,8 +191,9 @@ typedef struct {
 
 /** The solver's memory: limits, answer, and the rows that it ended with, in two arrays of the caller. */
 typedef struct {
-  koopmpc_real *low, *high;         /**< (m) limits of this solve */
-  koopmpc_real *dlow, *dhigh;       /**< (m) these limits in the scale of the solver */
+  koopmpc_real *low, *high;         /**< (m) limits */
+  int hard_alone;                   /**< whether soft rows have none in a solve */
+  koopmpc_real *dlow, *dhigh;       /**< (m) those of a solve, in its scale */
   koopmpc_real *product, *dual;     /**< (m) M v, and multipliers */
   koopmpc_real *primal, *u;         /**< (n) */
   koopmpc_real *lam, *lam_star, *D; /**< (k), k = n + soft + 1 */
@@ -202,6 +211,11 @@ typedef struct {
   int iterations; /**< of this solve */
 } koopmpc_qp_end;
 
+/** The status of a solve without a solution. */
+static inline koopmpc_status koopmpc_qp_status(koopmpc_qp_end end) {
+  return end.flag == -1 ? KOOPMPC_INFEASIBLE : end.flag == -4 ? KOOPMPC_MAX_ITERATIONS : KOOPMPC_FAILED;
+}
+
 /**
  * Solve within mem->low and mem->high, made `wider` by this share of 1 + their size.
  * The solution is mem->primal, its multipliers mem->dual; both are zero where there is none.
@@ -211,8 +225,14 @@ typedef struct {
 koopmpc_qp_end koopmpc_qp_solve(const koopmpc_qp *qp, koopmpc_qp_memory *mem, const koopmpc_real *push,
                                 koopmpc_real wider, int resume);
 
-/** Solve, and check the answer where rows give way; `good` says whether it is the solution. */
-koopmpc_qp_end koopmpc_qp_attempt(const koopmpc_qp *problem, koopmpc_qp_memory *qp, const koopmpc_real *push,
-                                  koopmpc_real wider, int resume, int *good);
+/**
+ * Solve, and again with limits a tolerance wider where that finds no solution, unless the hard rows contradict each
+ * other: mem->hard_alone says so then. Answers are checked where rows give way; `good` is 0 if it is no solution, 1 or 2 by the solve that found it.
+ */
+koopmpc_qp_end koopmpc_qp_find(const koopmpc_qp *qp, koopmpc_qp_memory *mem, const koopmpc_real *push, int resume,
+                               int *good);
+
+/** Whether the hard rows alone have no point in common; mem->hard_alone is the same. */
+int koopmpc_qp_contradicts(const koopmpc_qp *qp, koopmpc_qp_memory *mem);
 
 #endif
