@@ -13,10 +13,11 @@ import sys
 import tempfile
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
+from scipy.signal import cont2discrete
 
 import koopmpc as km
-from tests.speed.test_codegen import cart_pole
 
 HERE = Path(__file__).parent
 PROBLEMS = ("pendulum:upright", "cart_pole", "pendulum_swing", "pendulum_swing bilinear")
@@ -73,7 +74,11 @@ def exported(name: str, folder: Path) -> Path:
 
 def exported_benchmark(N: int, folder: Path) -> Path:
     """Export the cart-pole of LinearMPC.jl's benchmark in single precision, from 0.2 rad to a set point 1 m away."""
-    model, plant = cart_pole()
+    A = np.array([[0, 1, 0, 0], [0, -10, 9.81, 0], [0, 0, 0, 1], [0, -20, 39.24, 0]])
+    A, B, *_ = cont2discrete((A, 100 * np.array([[0], [1], [0], [2.0]]), np.eye(4), np.zeros((4, 1))), 0.01)
+    x, u = ca.SX.sym("x", 4), ca.SX.sym("u", 1)
+    model = km.LinearPredictor(A, B, np.eye(4), km.State(), 0.01, ("p", "v", "theta", "omega"), ("u",))
+    plant = km.StepMap(ca.Function("F", [x, u], [ca.DM(A) @ x + ca.DM(B) @ u]), 0.01, states=model.states)
     cost, end = km.Cost(Q=[1.44, 0, 1, 0], R=0.0, R_delta=0.01, tail=0), np.array([np.inf, np.inf, 0.3, np.inf])
     controller = km.KoopmanMPC(model, cost, km.Limits(-2, 2, x_min=-end, x_max=end, slack=(0.0, 1e3)), N)
     x0, row = [0.0, 0.0, 0.2, 0.0], [1.0, 0.0, 0.0, 0.0]

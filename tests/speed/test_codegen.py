@@ -5,11 +5,9 @@ All figures are CPU time of this process, in turns of what is compared, so that 
 
 import time
 
-import casadi as ca
 import daqp
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete
 
 import koopmpc as km
 from tests.speed.test_control import CHAIN, model, pendulum, report, timed
@@ -27,30 +25,6 @@ def cpu(call, *arguments, count=500):
             call(*arguments)
         rows.append((time.process_time() - start) / count)
     return float(np.median(rows))
-
-
-def test_c_step_with_nothing_active(benchmark, model):
-    slow = km.KoopmanMPC(model, km.Cost(Q=[10, 1], R=0.1), km.Limits(-25, 25), 40, solver="daqp")
-    spent, fast = timed(km.compiled, slow)
-    x, reference = np.array([0.01, 0.02]), np.zeros(2)
-    assert fast(x, reference).status is km.Status.UNCONSTRAINED
-    benchmark(fast, x, reference)
-    ours, theirs = cpu(fast, x, reference), cpu(slow, x, reference)
-    plant, steps = pendulum(), 20_000
-    X, U = np.zeros((steps + 1, 2)), np.zeros((steps, 1))
-    X[0] = 0.01
-    found = fast.whole_run(plant, np.zeros((steps + 41, 2)), None, X, X, U, preview=True)
-    empty = cpu(time.perf_counter)
-    report(
-        benchmark,
-        **{
-            "C step, with its clock µs": float(np.median(found["solve_time"])) * 1e6,
-            "from Python µs": ours * 1e6,
-            "Python's step µs": theirs * 1e6,
-            "a look at the clock µs": empty * 1e6,
-            "built in s": spent,
-        },
-    )
 
 
 def test_c_step_with_limits_active_against_daqp(benchmark):
@@ -100,69 +74,6 @@ def test_c_step_with_limits_active_against_daqp(benchmark):
     )
 
 
-def cart_pole():
-    """Return the linear cart-pole of LinearMPC.jl's benchmark of generated C (docs/src/manual/benchmark.md)."""
-    A = np.array([[0, 1, 0, 0], [0, -10, 9.81, 0], [0, 0, 0, 1], [0, -20, 39.24, 0]])
-    A, B, *_ = cont2discrete((A, 100 * np.array([[0], [1], [0], [2.0]]), np.eye(4), np.zeros((4, 1))), 0.01)
-    x, u = ca.SX.sym("x", 4), ca.SX.sym("u", 1)
-    names = ("p", "v", "theta", "omega")
-    plant = km.StepMap(ca.Function("F", [x, u], [ca.DM(A) @ x + ca.DM(B) @ u]), 0.01, states=names, inputs=("u",))
-    return km.LinearPredictor(A, B, np.eye(4), km.State(), 0.01, names, ("u",)), plant
-
-
-class TimedSolver:
-    """DAQP's model, which sums the seconds that DAQP says its solves take."""
-
-    def __init__(self, model):
-        self.model, self.seconds, self.iterations = model, 0.0, 0
-
-    def __getattr__(self, name):
-        return getattr(self.model, name)
-
-    def solve(self, *arguments, **options):
-        answer = self.model.solve(*arguments, **options)
-        self.seconds += answer[3]["solve_time"]
-        self.iterations += answer[3]["iterations"]
-        return answer
-
-
-@pytest.mark.parametrize("N", [50, 75, 100, 125])
-def test_c_steps_of_the_cart_pole_of_other_generators(benchmark, N):
-    """Weights, limits and references of the published table; beside it the time of DAQP alone on the same QPs."""
-    model, plant = cart_pole()
-    cost, end = km.Cost(Q=[1.44, 0, 1, 0], R=0.0, R_delta=0.01, tail=0), np.array([np.inf, np.inf, 0.3, np.inf])
-    slow = km.KoopmanMPC(model, cost, km.Limits(-2, 2, x_min=-end, x_max=end, slack=(0.0, 1e3)), N)
-    fast, steps = km.compiled(slow), 500
-    rows = np.zeros((steps + 1 + N, 4))
-    rows[:, 0] = np.where(np.arange(len(rows)) < 250, 1.0, -0.5)
-    X, U, ours, alone = np.zeros((steps + 1, 4)), np.zeros((steps, 1)), [], []
-    X[0, 2] = 0.2
-    solver = slow._step.solver.qps.first
-    solver._model = TimedSolver(solver._model)
-    for _ in range(5):
-        fast.reset()
-        slow.reset()
-        ours.append(np.array(fast.whole_run(plant, rows, None, X, X, U, preview=False)["solve_time"]))
-        spent = [0.0]
-        for x, row in zip(X, rows[:steps], strict=False):
-            slow(x, row)
-            spent.append(solver._model.seconds)
-        solver._model.seconds = 0.0
-        alone.append(np.diff(spent))
-    ours, alone = np.min(ours, axis=0), np.min(alone, axis=0)
-    limited, slowest = alone > 0, steps // 5
-    benchmark(fast, X[0], rows[0])
-    report(
-        benchmark,
-        **{
-            "median µs": float(np.median(ours)) * 1e6,
-            "mean of the slowest fifth µs": float(np.sort(ours)[-slowest:].mean()) * 1e6,
-            "steps with a QP": int(limited.sum()),
-            "these to DAQP's own time": float(ours[limited].sum() / alone[limited].sum()),
-        },
-    )
-
-
 def test_cold_steps(benchmark, model):
     """A step after 4 ms of sleep over the same step at once, in C and in Python, and after a rehearsal.
 
@@ -197,7 +108,7 @@ def test_c_step_of_a_thousand_observables(benchmark):
     big = km.LinearPredictor(A, B, np.eye(2, 1000), lifting, 0.05, ("a", "b"), ("u",))
     slow = km.KoopmanMPC(big, km.Cost([1.0, 1.0], 0.1), km.Limits(-9, 9), 40, solver="daqp")
     spent, fast = timed(km.compiled, slow)
-    x, zero, matrix = np.array([0.1, 0.2]), np.zeros(2), slow._map.matrix[:, :1000].copy()
+    x, zero, matrix = np.array([0.1, 0.2]), np.zeros(2), slow.build_program(None).M[:, :1000].copy()
 
     def by_numpy():
         return matrix @ lifting(x)
@@ -249,73 +160,3 @@ def test_a_thousand_runs(benchmark, model):
             "simulate's ratio": python / hooked,
         },
     )
-
-
-def test_c_bilinear_step_against_python(benchmark):
-    """The swing-up of the cart-pole from hanging: all its steps in C and in Python, in turns; the model is the plant."""
-    problem = km.load_problem("cart_pole_swing")
-    plant = km.discretize(problem.dynamics, problem.dt)
-    data = km.collect(plant, problem.training.x0, problem.training.excitation, episodes=2000, steps=10, rng=0)
-    slow = km.BilinearMPC(
-        km.bilinear_edmd(data, problem.lifting, difference=True), problem.cost, problem.limits, problem.horizon
-    )
-    spent, fast = timed(km.compiled, slow)
-    case = problem.cases["hang"]
-    run = km.simulate(plant, slow, x0=case.x0, reference=case.reference, steps=case.steps)
-    rows = {slow: [], fast: []}
-    for _ in range(5):
-        for one, found in rows.items():
-            one.reset()
-            start = time.process_time()
-            for x in run.X[:-1]:
-                one(x, case.reference)
-            found.append(time.process_time() - start)
-    theirs, ours = (float(np.median(found)) / case.steps for found in rows.values())
-    free = {one: cpu(one, run.X[-1], case.reference, count=50) for one in rows}
-    benchmark(fast, run.X[-1], case.reference)
-    report(
-        benchmark,
-        **{
-            "a step of the swing-up in C µs": ours * 1e6,
-            "in Python µs": theirs * 1e6,
-            "Python to C": theirs / ours,
-            "free step in C µs": free[fast] * 1e6,
-            "free step, Python to C": free[slow] / free[fast],
-            "built in s": spent,
-        },
-    )
-
-
-def test_c_step_of_a_linear_mpc_beside_tinympc(benchmark):
-    """TinyMPC's own cart-pole, ±0.45 N, 0.5 m off, N = 60: closed-loop cost of 400 steps and CPU time of a step in both."""
-    tinympc = pytest.importorskip("tinympc")
-    A = np.array([[1.0, 0.01, 0, 0], [0, 1.0, 0.039, 0], [0, 0, 1.002, 0.01], [0, 0, 0.458, 1.002]])
-    B, Q, R = np.array([[0.0], [0.02], [0.0], [0.067]]), np.array([10.0, 1.0, 10.0, 1.0]), np.array([1.0])
-    model = km.LinearPredictor(A, B, np.eye(4), km.State(), 0.01, tuple("abcd"), ("u",))
-    ours = km.compiled(km.KoopmanMPC(model, km.Cost(Q, R), km.Limits(-0.45, 0.45), 60, solver="daqp"))
-    theirs = tinympc.TinyMPC()
-    theirs.setup(A, B, np.diag(Q), np.diag(R), 61, rho=1.0, verbose=False, max_iter=100)
-    theirs.set_bound_constraints(
-        np.full((4, 61), -1e17), np.full((4, 61), 1e17), np.full((1, 60), -0.45), np.full((1, 60), 0.45)
-    )
-
-    def asked(x):
-        theirs.set_x0(x)
-        return np.atleast_1d(theirs.solve()["controls"])
-
-    figures, zero = {}, np.zeros(4)
-    for name, law in (("C", lambda x: ours(x, zero).u), ("TinyMPC", asked)):
-        x, cost, spent = np.array([0.5, 0.0, 0.0, 0.0]), 0.0, []
-        for _ in range(400):
-            start = time.process_time()
-            u = np.clip(law(x), -0.45, 0.45)
-            spent.append(time.process_time() - start)
-            cost += float(Q @ x**2 + R @ u**2)
-            x = A @ x + B @ u
-        figures |= {
-            f"{name} cost": cost,
-            f"{name} mean µs": 1e6 * float(np.mean(spent)),
-            f"{name} worst µs": 1e6 * max(spent),
-        }
-    benchmark(ours, zero, zero)
-    report(benchmark, **figures)

@@ -1,4 +1,4 @@
-"""A Koopman MPC step from x to u: nothing active, limits active against bare OSQP, many observables; and start-up."""
+"""A Koopman MPC step from x to u: a monitor, estimators, limits active against bare solvers; and start-up."""
 
 import os
 import subprocess
@@ -18,7 +18,6 @@ pytestmark = pytest.mark.speed
 
 def report(benchmark, **figures):
     benchmark.extra_info.update(figures)
-    sys.stdout.write(f"\n{benchmark.name}: " + ", ".join(f"{k} {v:.3g}" for k, v in figures.items()) + "\n")
 
 
 def timed(call, *arguments):
@@ -47,35 +46,6 @@ def model():
     found = km.edmd(data, lifting)
     assert found.nz == 12
     return found
-
-
-def test_step_with_nothing_active(benchmark, model):
-    mpc = km.KoopmanMPC(model, km.Cost(Q=[10, 1], R=0.1), km.Limits(-25, 25), 40)
-    rng = np.random.default_rng(0)
-    states, reference = 0.05 * rng.normal(size=(4000, 2)), np.zeros(2)
-    times = []
-    for x in states:
-        t, move = timed(mpc, x, reference)
-        assert move.status is km.Status.UNCONSTRAINED
-        times.append(t)
-    benchmark(mpc, states[0], reference)
-    half, high = np.quantile(times, [0.5, 0.99]) * 1e6
-    report(benchmark, **{"median µs": half, "p99 µs": high})
-
-
-@pytest.mark.parametrize("N", [20, 40, 100])
-def test_step_with_a_moving_reference(benchmark, model, N):
-    """Resting and moving steps by turns: the ratio is what a reference that moves costs."""
-    cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(-25, 25)
-    rest, rows, row = (km.KoopmanMPC(model, cost, limits, N) for _ in range(3))
-    signal = 0.01 * np.sin(0.1 * np.arange(4001 + N))[:, None] * np.ones(2)
-    x, times = np.array([0.02, 0.0]), []
-    for k in range(4000):
-        ahead, now = signal[k : k + N + 1], signal[k]
-        times.append([timed(rest, x, np.zeros(2))[0], timed(rows, x, ahead)[0], timed(row, x, now)[0]])
-    benchmark(rest, x, np.zeros(2))
-    resting, moving, single = np.median(times, axis=0) * 1e6
-    report(benchmark, **{"resting µs": resting, "rows": moving / resting, "one row": single / resting})
 
 
 def test_step_with_a_monitor(benchmark):
@@ -206,23 +176,6 @@ def compared(benchmark, ours, theirs, iterations):
     )
 
 
-@pytest.mark.parametrize("limits", ["inputs", "inputs and soft states"])
-def test_step_with_limits_active(benchmark, model, limits):
-    """The same QPs, one after the other, by the controller and by OSQP's own Python interface."""
-    plant = pendulum()
-    ends = {} if limits == "inputs" else {"x_min": [-np.inf, -1.5], "x_max": [np.inf, 1.5]}
-    mpc = km.KoopmanMPC(model, km.Cost(Q=[10, 1], R=0.1), km.Limits(-10, 10, **ends), 40)
-    x, states = np.array([1.4, 0.0]), []
-    for _ in range(300):
-        states.append(x)
-        x = plant(x, mpc(x, np.zeros(2)).u)
-        x[0] = np.mod(x[0] + np.pi, 2 * np.pi) - np.pi
-    found = beside_the_bare_solver(mpc, "osqp", states, 1)
-    assert len(found[0]) > 100
-    benchmark(mpc, states[1], np.zeros(2))
-    compared(benchmark, *found)
-
-
 CHAIN = np.array([[1, 0.1, 0, 0], [0, 1.02, 0.1, 0], [0, 0, 0.95, 0.1], [0, 0, 0, 0.9]])
 
 
@@ -273,47 +226,6 @@ def test_step_with_an_estimator(benchmark, model, name):
     (half, plain), (high, plain_high) = np.quantile(times, [0.5, 0.99], axis=0) * 1e6
     figures = {"median µs": half, "without µs": plain, "p99 µs": high, "without p99 µs": plain_high}
     report(benchmark, **figures, ratio=half / plain)
-
-
-class Lifted:
-    """A lifting that costs nothing: z is there already."""
-
-    def __init__(self, z):
-        self.arguments, self.results, self.evaluate = (np.zeros(2),), (z,), lambda: None
-
-
-def controller(nz, rng):
-    A = np.diag(rng.uniform(0.2, 0.9, nz)) + 0.1 / nz * rng.normal(size=(nz, nz))
-    lifting = km.State() + km.Gaussian(rng.normal(size=(nz - 2, 2)), 0.5)
-    B = rng.normal(size=(nz, 1))
-    predictor = km.LinearPredictor(A, B, np.eye(2, nz), lifting, 0.05, ("a", "b"), ("u",))
-    mpc = km.KoopmanMPC(predictor, km.Cost(1, 1, Q_N=np.eye(nz)), km.Limits(-1e6, 1e6), 40)
-    mpc.observer.lift = Lifted(0.1 * rng.normal(size=nz))
-    return mpc
-
-
-def test_step_with_many_observables(benchmark):
-    rng = np.random.default_rng(0)
-    small, large = controller(10, rng), controller(1000, rng)
-    M, z = rng.normal(size=(40, 1000)), rng.normal(size=1000)
-    out, x, reference = np.empty(40), np.zeros(2), np.zeros(2)
-    calls = (
-        lambda: small(x, reference),
-        lambda: large(x, reference),
-        lambda: np.dot(M, z, out=out),
-    )
-    times = [[timed(call)[0] for call in calls] for _ in range(3000)]
-    benchmark(large, x, reference)
-    few, many, product = 1e6 * np.median(times, axis=0)
-    report(
-        benchmark,
-        **{
-            "µs at 10": few,
-            "µs at 1000": many,
-            "product µs": product,
-            "ratio to step at 10 + product": many / (few + product),
-        },
-    )
 
 
 @pytest.mark.parametrize("what", ["import", "help"])

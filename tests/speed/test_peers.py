@@ -1,6 +1,5 @@
 """A whole step beside peers: the same MPC written in CVXPY with parameters, and do-mpc on the same plants."""
 
-import sys
 import time
 
 import casadi as ca
@@ -19,7 +18,6 @@ LIMITS = {
 
 def report(benchmark, **figures):
     benchmark.extra_info.update(figures)
-    sys.stdout.write(f"\n{benchmark.name}: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()) + "\n")
 
 
 def timed(call, *arguments):

@@ -3,7 +3,6 @@
 import os
 import shlex
 import shutil
-import sys
 import time
 
 import numpy as np
@@ -30,7 +29,6 @@ def episodes():
 
 def report(benchmark, unit, value):
     benchmark.extra_info[unit] = value
-    sys.stdout.write(f"\n{benchmark.name}: {value:.3g} {unit}\n")
 
 
 @pytest.mark.skipif(not any(map(shutil.which, COMPILERS)), reason="no C compiler here")
