@@ -124,7 +124,7 @@ class Compiled(CompiledLoops):
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # takes a linear plan and its start to the states
         self._ny, self._nr, self._nw = sizes["NY"], sizes["NR"], sizes["NW"]
         self._memory = np.zeros(-(-int(self._code.koopmpc_state_size()) // 8))
-        self._plants: dict[int, tuple[StepMap, ctypes.CDLL]] = {}
+        self._plant: tuple[StepMap, ctypes.CDLL] | None = None
         self._connect()
         self.reset()
 
@@ -349,7 +349,6 @@ class Compiled(CompiledLoops):
         """Return a copy that shares no state with this one."""
         twin = object.__new__(Compiled)
         twin.__dict__.update(self.__dict__)
-        twin._plants = dict(self._plants)  # two threads may run two copies
         twin._memory = self._memory.copy()
         twin._connect()
         return twin

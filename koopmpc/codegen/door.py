@@ -18,32 +18,26 @@ class Rows(ctypes.Structure):
     _fields_ = (("values", ctypes.c_void_p), ("count", ctypes.c_int))
 
 
-_FIELDS = (
-    ("state", ctypes.c_void_p),
-    ("y", ctypes.c_void_p),
-    ("reference", Rows),
-    ("applied", ctypes.c_void_p),
-    ("w", Rows),
-    ("u", ctypes.c_void_p),
-    ("status", ctypes.c_int),
-    ("fallback", ctypes.c_int),
-    ("iterations", ctypes.c_int),
-)
-
-
-_LAST = ("bounds", ctypes.c_void_p)
+def _list_fields(real: type) -> tuple[tuple[str, type], ...]:
+    """Return the fields of a call's arguments and results."""
+    pointer, whole = ctypes.c_void_p, ctypes.c_int
+    return (
+        *(("state", pointer), ("y", pointer), ("reference", Rows), ("applied", pointer), ("w", Rows), ("u", pointer)),
+        *((name, whole) for name in ("status", "fallback", "iterations")),
+        *(("slack", real), ("refused", whole), ("gap", real), ("bounds", pointer)),
+    )
 
 
 class Frame(ctypes.Structure):
     """The arguments and results of a call, as in C."""
 
-    _fields_ = (*_FIELDS, ("slack", ctypes.c_double), ("refused", ctypes.c_int), ("gap", ctypes.c_double), _LAST)
+    _fields_ = _list_fields(ctypes.c_double)
 
 
 class SingleFrame(ctypes.Structure):
     """A `Frame` in single precision."""
 
-    _fields_ = (*_FIELDS, ("slack", ctypes.c_float), ("refused", ctypes.c_int), ("gap", ctypes.c_float), _LAST)
+    _fields_ = _list_fields(ctypes.c_float)
 
 
 _BOUNDS = ("u_low", "u_high", "du_low", "du_high", "x_low", "x_high")

@@ -22,7 +22,6 @@ from koopmpc.plants.step_map import StepMap
 STATUSES = list(Status)
 FALLBACKS = list(Fallback)
 _ROWS = 100_000  # reference rows whose targets a controller keeps
-_PLANTS = 8  # plants whose machine code a controller keeps
 # head of the C file of a plant
 _PLANT_HEAD = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
 
@@ -134,7 +133,7 @@ class CompiledLoops:
     _code: ctypes.CDLL
     _sizes: dict[str, int]
     _pointer: ctypes.c_void_p
-    _plants: dict[int, tuple[StepMap, ctypes.CDLL]]
+    _plant: tuple[StepMap, ctypes.CDLL] | None
     _targets: TargetTable | None
     _timed: bool
     _is_double: bool
@@ -259,10 +258,9 @@ class CompiledLoops:
         return ManyRuns(X, U, reports[..., 0], reports[..., 1], slack)
 
     def _compile_plant(self, plant: StepMap) -> ctypes.CDLL | None:
-        """Return the plant in machine code, compiled at its first run; None where no C code of it can be generated."""
-        known = self._plants.get(id(plant))
-        if known is not None:
-            return known[1]
+        """Return the plant in machine code, compiled unless it is the last one; None where it cannot be."""
+        if self._plant is not None and self._plant[0] is plant:
+            return self._plant[1]
         command = find_compiler() if self._is_double else None
         if command is None:
             return None
@@ -272,7 +270,5 @@ class CompiledLoops:
             )
         except (DataError, OSError, subprocess.SubprocessError):
             return None
-        while len(self._plants) >= _PLANTS:
-            self._plants.pop(next(iter(self._plants)))
-        self._plants[id(plant)] = plant, code
+        self._plant = plant, code
         return code

@@ -142,44 +142,24 @@ _BUILD = """<?xml version="1.0" encoding="UTF-8"?>
 _WHOLE = (("status", _STATUS), ("fallback", _FALLBACK), ("iterations", "iterations of the QP solver"))
 
 
-def _list_variables_2(reals: list[_Real]) -> list[str]:
-    """Return the elements of all variables by FMI 2."""
+def _list_variables(reals: list[_Real], version: FMIVersion) -> list[str]:
+    """Return the elements of all variables; those of FMI 3 have time among them."""
     rows: list[str] = []
-    for i, each in enumerate(reals):
-        kind = "fixed" if each.cause == "parameter" else "discrete"
-        exact = ' initial="exact"' if each.cause != "input" else ""
-        unit = f" unit={quoteattr(each.unit)}" if each.unit else ""
-        rows.append(
-            f'    <ScalarVariable name="{each.name}" valueReference="{i}" causality="{each.cause}" '
-            f'variability="{kind}"{exact} description={quoteattr(each.what)}>'
-            f'<Real start="0"{unit}/></ScalarVariable>'
+    for i, each in enumerate([*reals, *(_Real(word, "output", "", what) for word, what in _WHOLE)]):
+        kind, exact = "fixed" if each.cause == "parameter" else "discrete", each.cause != "input"
+        about = f'name="{each.name}" valueReference="{i}" causality="{each.cause}" variability="{kind}"'
+        about += (' initial="exact"' if exact else "") + f" description={quoteattr(each.what)}"
+        value = 'start="0"' + (f" unit={quoteattr(each.unit)}" if each.unit else "")
+        if version == 3:
+            rows.append(f"    <{'Float64' if i < len(reals) else 'Int32'} {about} {value}/>")
+        else:
+            tag = "Real" if i < len(reals) else "Integer"
+            rows.append(f"    <ScalarVariable {about}><{tag} {value}/></ScalarVariable>")
+    if version == 3:
+        time = (
+            f'    <Float64 name="time" valueReference="{len(rows)}" causality="independent" variability="continuous"/>'
         )
-    for i, (word, what) in enumerate(_WHOLE, len(reals)):
-        rows.append(
-            f'    <ScalarVariable name="{word}" valueReference="{i}" causality="output" variability="discrete" '
-            f'initial="exact" description={quoteattr(what)}><Integer start="0"/></ScalarVariable>'
-        )
-    return rows
-
-
-def _list_variables_3(reals: list[_Real]) -> list[str]:
-    """Return the elements of all variables by FMI 3, time among them."""
-    rows: list[str] = []
-    for i, each in enumerate(reals):
-        kind = ' variability="fixed"' if each.cause == "parameter" else ' variability="discrete"'
-        kind += ' initial="exact"' if each.cause != "input" else ""
-        unit = f" unit={quoteattr(each.unit)}" if each.unit else ""
-        rows.append(
-            f'    <Float64 name="{each.name}" valueReference="{i}" causality="{each.cause}"{kind} start="0"{unit} '
-            f"description={quoteattr(each.what)}/>"
-        )
-    for i, (word, what) in enumerate(_WHOLE, len(reals)):
-        rows.append(
-            f'    <Int32 name="{word}" valueReference="{i}" causality="output" variability="discrete" '
-            f'initial="exact" start="0" description={quoteattr(what)}/>'
-        )
-    time = len(reals) + len(_WHOLE)
-    rows.append(f'    <Float64 name="time" valueReference="{time}" causality="independent" variability="continuous"/>')
+        rows.append(time)
     return rows
 
 
@@ -208,7 +188,7 @@ def _describe(tables: Tables, name: str, token: str, version: FMIVersion) -> str
             f'  <CoSimulation modelIdentifier="{name}" canHandleVariableCommunicationStepSize="false">\n'
             f'    <SourceFiles><File name="{name}.c"/></SourceFiles>\n  </CoSimulation>\n'
         )
-    variables = "\n".join((_list_variables_3 if version == 3 else _list_variables_2)(reals))
+    variables = "\n".join(_list_variables(reals, version))
     return (
         f'<?xml version="1.0" encoding="UTF-8"?>\n<fmiModelDescription {opening} {head}>\n{interface}{definitions}'
         f"{experiment}  <ModelVariables>\n{variables}\n  </ModelVariables>\n"
