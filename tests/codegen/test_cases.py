@@ -11,7 +11,7 @@ from tests.codegen import plants
 from tests.codegen.test_parity import COST, random_linear
 from tests.compiler import needs_compiler
 from tests.control.test_levels import TANK, draw_model
-from tests.synthesis.test_abreast import make
+from tests.synthesis.test_loops import make
 from tests.tiers import few
 
 pytestmark = needs_compiler

@@ -308,7 +308,7 @@ def test_each_kind_without_c_code_says_why(pendulum, tmp_path):
     energy = km.Expressions(lambda x: [x[1] ** 2], ["E"]).bind(plant.states)
     feedback, watched = km.LQR(model, COST, limits), km.KoopmanMPC(model, COST, limits, 5, monitor=data)
     online = km.OnlineEDMD.start(data, model.lifting)
-    implicit = km.discretize(km.load_problem("pendulum").dynamics, 0.05, km.Collocation(2))
+    implicit = km.discretize(km.load_problem("pendulum").dynamics, 0.05, km.plants.Collocation(2))
     some, levels = draw_model(np.random.default_rng(0), 2), km.Limits(levels=[[0, 1], None])
     own = km.KoopmanMPC(model, COST, limits, 5, estimator=Told([0.0] * model.nz))
     crowded = km.Limits(x_max=0.3, of=km.State(), y_max=0.2, priority=[0, 1, 2, 3])
