@@ -86,23 +86,6 @@ def _find_error(error: Exception) -> str:
     return lines[0] if lines else str(error)
 
 
-def _compile(program: StepProgram, precision: Precision, command: list[str]) -> tuple[ctypes.CDLL, dict[str, int]]:
-    """Return the machine code of a controller, for this processor if the compiler knows its flags, and the sizes.
-
-    Raises
-    ------
-    OSError, subprocess.SubprocessError
-        The compiler fails or its output does not load.
-    """
-    single = precision == "float"
-    tables = make_tables(program, single=single, room=_ROOM)
-    text = write_one_source(tables, single=single)
-    code = load_library(text, command, find_private_cache(), native=True)
-    code.koopmpc_state_size.restype = ctypes.c_long
-    code.koopmpc_init.restype = code.koopmpc_call.restype = None
-    return code, tables.sizes
-
-
 class Compiled(CompiledLoops):
     """A controller in machine code; see `compiled`.
 
@@ -111,8 +94,11 @@ class Compiled(CompiledLoops):
 
     def __init__(self, controller: Controller, program: StepProgram, precision: Precision, command: list[str]) -> None:
         self.original, self.precision = controller, precision
-        self._code, self._sizes = _compile(program, precision, command)
-        sizes = self._sizes
+        tables = make_tables(program, single=precision == "float", room=_ROOM)
+        text = write_one_source(tables, single=precision == "float")
+        self._code, sizes = load_library(text, command, find_private_cache(), native=True), tables.sizes
+        self._code.koopmpc_state_size.restype, self._sizes = ctypes.c_long, sizes
+        self._code.koopmpc_init.restype = self._code.koopmpc_call.restype = None
         self.dt, self.nu, self.horizon = program.dt, sizes["NU"], sizes["HORIZON"]
         self.cost, self.limits = getattr(controller, "cost", None), getattr(controller, "limits", None)
         self.model = program.model

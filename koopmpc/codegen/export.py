@@ -127,10 +127,9 @@ def export(
     texts = rename_symbols(texts, name)
     root = path_of(folder)
     _refuse_others(root, {*texts, "README.md", f"{name}.fmu"}, name)
-    for path, text in texts.items():
-        _write(root / path, text)
+    _write_files(root, texts)
     readme = {"README.md": _write_readme(tables, _measure_objects(root, name), precision)}
-    _write(root / "README.md", rename_symbols(readme, name)["README.md"])
+    _write_files(root, rename_symbols(readme, name))
     if fmu is not None:
         write_unit(tables, own, root / f"{name}.fmu", name, 2 if fmu == 2 else 3)
     return root
@@ -161,9 +160,10 @@ def _state_iterations(tables: Tables, figure: IterationBound | ObservedIteration
     tables.effort = f"Iterations of the QP solver: {figure}.{warm}"
 
 
-def _write(path: Path, text: str) -> None:
-    with writing(path) as file:
-        file.write(text.encode())
+def _write_files(root: Path, texts: dict[str, str]) -> None:
+    for name, text in texts.items():
+        with writing(root / name) as file:
+            file.write(text.encode())
 
 
 def _refuse_others(root: Path, known: set[str], prefix: str) -> None:

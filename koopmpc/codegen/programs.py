@@ -1,6 +1,5 @@
 """From a `Program` to the `Tables` of its C code: its fields, what they lead to, and the sizes of memory."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -185,9 +184,8 @@ def _add_sizes(tables: Tables, program: StepProgram) -> None:
     if bounds is not None:
         tables.notes.append(_BOUNDS_NOTE)
     _name_functions(tables, program)
-    _add_memory(
-        sizes, "TARGET", [(sizes[f"{name}_VARIABLES"], sizes[f"{name}_COUNT"], 0) for name in _target_solvers(sizes)]
-    )
+    solvers = [name for name in ("TARGET_SOLVERS_0", "TARGET_SOLVERS_1") if name in sizes]
+    _add_memory(sizes, "TARGET", [(sizes[f"{name}_VARIABLES"], sizes[f"{name}_COUNT"], 0) for name in solvers])
 
 
 def _name_functions(tables: Tables, program: StepProgram) -> None:
@@ -201,10 +199,6 @@ def _name_functions(tables: Tables, program: StepProgram) -> None:
         counts = {argument: inside[argument] for argument in arguments if inside[argument]}
         functions[name] = CFunction(graph, counts, result)
     tables.functions = functions
-
-
-def _target_solvers(sizes: Mapping[str, int]) -> list[str]:
-    return [name for name in ("TARGET_SOLVERS_0", "TARGET_SOLVERS_1") if name in sizes]
 
 
 def _add_memory(sizes: dict[str, int], name: str, problems: list[tuple[int, int, int]]) -> None:

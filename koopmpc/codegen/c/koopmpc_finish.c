@@ -18,27 +18,22 @@ enum {
   FINISHED = 150 /* about as many interior-point steps take as long; how many iterations there are rounding decides */
 };
 
-/** x and u = -K x + L^-T w of a stage, w its part of `all`; NULL for zero. */
-static void deviate(const koopmpc_state *s, int k, const koopmpc_real *all, const koopmpc_real *x, koopmpc_real *u,
-                    koopmpc_real *next) {
-  const koopmpc_real *half = s->half + k * NV * NV;
-  for (int i = NV - 1; i >= 0; i--) {
-    u[i] = koopmpc_free[k] && all ? all[koopmpc_finish_at[k] * NV + i] : 0;
-    for (int j = i + 1; j < NV; j++) u[i] -= half[j * NV + i] * u[j];
-    u[i] /= half[i * NV + i];
-  }
-  for (int i = 0; i < NV; i++) u[i] -= koopmpc_dot(s->K + (k * NV + i) * NS, x, NS);
-  for (int i = 0; i < NS; i++)
-    next[i] = koopmpc_dot(s->A + (k * NS + i) * NS, x, NS) + koopmpc_dot(s->B + (k * NS + i) * NV, u, NV);
-}
-
-/** Write the trajectory that w leads to: newX and newU. */
+/** Write the trajectory that w leads to, newX and newU: u = -K x + L^-T w of each stage. */
 static void deviation(koopmpc_state *s, const koopmpc_real *w) {
   koopmpc_real x[NS];
   koopmpc_fill(x, 0, NS);
   for (int k = 0; k < STEPS; k++) {
-    deviate(s, k, w, x, s->newU + k * NV, s->newX + k * NS);
-    koopmpc_copy(x, s->newX + k * NS, NS);
+    const koopmpc_real *half = s->half + k * NV * NV;
+    koopmpc_real *u = s->newU + k * NV, *next = s->newX + k * NS;
+    for (int i = NV - 1; i >= 0; i--) {
+      u[i] = koopmpc_free[k] ? w[koopmpc_finish_at[k] * NV + i] : 0;
+      for (int j = i + 1; j < NV; j++) u[i] -= half[j * NV + i] * u[j];
+      u[i] /= half[i * NV + i];
+    }
+    for (int i = 0; i < NV; i++) u[i] -= koopmpc_dot(s->K + (k * NV + i) * NS, x, NS);
+    for (int i = 0; i < NS; i++)
+      next[i] = koopmpc_dot(s->A + (k * NS + i) * NS, x, NS) + koopmpc_dot(s->B + (k * NS + i) * NV, u, NV);
+    koopmpc_copy(x, next, NS);
   }
 }
 

@@ -72,10 +72,8 @@ void koopmpc_round_levels(const koopmpc_state *s, koopmpc_real *u, const koopmpc
   for (int i = 0; i < NU; i++) {
     int level = nearest_level(u[i], i), least, most;
 #if KOOPMPC_RATES
-    const koopmpc_real from = KOOPMPC_FN(ceil)(place_of(before[i] + KOOPMPC_RATES_LOW(s)[i], i) - KOOPMPC_NEAR_LEVEL);
-    const koopmpc_real to = KOOPMPC_FN(floor)(place_of(before[i] + KOOPMPC_RATES_HIGH(s)[i], i) + KOOPMPC_NEAR_LEVEL);
-    if (from <= to && from < (koopmpc_real)koopmpc_levels_levels_count[i] && to >= 0)
-      level = (int)koopmpc_clip((koopmpc_real)level, from, to);
+    levels_inside(before[i] + KOOPMPC_RATES_LOW(s)[i], before[i] + KOOPMPC_RATES_HIGH(s)[i], i, &least, &most);
+    if (least <= most) level = level < least ? least : level > most ? most : level;
 #else
     (void)before;
 #endif

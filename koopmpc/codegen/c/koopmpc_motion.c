@@ -67,10 +67,8 @@ static int extend(koopmpc_state *s, int j, int *drifts) {
     }
     (void)koopmpc_inverse(past, rows, terms, KOOPMPC_TERMS, inverse, 0);
     for (int i = 0; i < terms; i++) c[i] = koopmpc_dot(inverse + i * rows, z + order, rows);
-    for (int k = 0; k < rows; k++) {
-      const koopmpc_real missed = koopmpc_abs(koopmpc_dot(c, z + k, order) + c[order] - z[k + order]);
-      if (!(missed <= most)) most = missed;
-    }
+    for (int k = 0; k < rows; k++)
+      most = koopmpc_most(most, koopmpc_dot(c, z + k, order) + c[order] - z[k + order]);
     if (!(most <= KOOPMPC_FITS) || grows(c, order)) continue;
     koopmpc_copy(last, z + rows, order);
     for (int i = 0; i < order; i++) sum += c[i];

@@ -165,7 +165,7 @@ koopmpc_qp_end koopmpc_qp_solve(const koopmpc_qp *qp, koopmpc_qp_memory *mem, co
 /** Whether x + M' lambda = 0 and low <= M x <= high hold, and soft rows give way at their price. */
 static int accurate(const koopmpc_qp *problem, const koopmpc_qp_memory *qp) {
   const int n = problem->n, m = problem->m;
-  koopmpc_real stationarity = 0, size = 1, near = 1;
+  koopmpc_real stationarity = 0, size = 1, near;
   koopmpc_real *pull = qp->u; /* the solution is in primal, too */
   koopmpc_fill(pull, 0, n);
   for (int i = 0; i < m; i++) {
@@ -175,20 +175,14 @@ static int accurate(const koopmpc_qp *problem, const koopmpc_qp_memory *qp) {
     }
   }
   for (int j = 0; j < n; j++) {
-    if (koopmpc_abs(pull[j]) > size) size = koopmpc_abs(pull[j]);
-    if (koopmpc_abs(qp->primal[j]) > size) size = koopmpc_abs(qp->primal[j]);
-    if (!(koopmpc_abs(pull[j] + qp->primal[j]) <= stationarity)) stationarity = koopmpc_abs(pull[j] + qp->primal[j]);
+    size = koopmpc_most(koopmpc_most(size, pull[j]), qp->primal[j]);
+    stationarity = koopmpc_most(stationarity, pull[j] + qp->primal[j]);
   }
 #ifdef KOOPMPC_FLOAT
-  for (int i = 0; i < m; i++) /* the sum above is rounded by a share of its largest term */
-    if (koopmpc_abs(qp->dual[i]) > size) size = koopmpc_abs(qp->dual[i]);
+  size = koopmpc_most(size, koopmpc_largest(qp->dual, m)); /* the sum above is rounded by a share of its largest term */
 #endif
   if (!(stationarity <= KOOPMPC_ACCURACY * size)) return 0;
-  for (int i = 0; i < m; i++) {
-    const koopmpc_real value = koopmpc_abs(qp->product[i]);
-    if (value > near) near = value;
-  }
-  near *= KOOPMPC_ACCURACY;
+  near = KOOPMPC_ACCURACY * koopmpc_most(koopmpc_largest(qp->product, m), 1);
   for (int i = 0; i < m; i++) {
     const koopmpc_real over = qp->product[i] - qp->dhigh[i] / problem->scaling[i];
     const koopmpc_real under = qp->dlow[i] / problem->scaling[i] - qp->product[i];

@@ -543,16 +543,11 @@ void koopmpc_use_targets(koopmpc_state *s, const koopmpc_real *targets, int coun
 
 void koopmpc_decide(koopmpc_state *s, const koopmpc_rows *reference, const koopmpc_real *applied, koopmpc_real *u,
                     koopmpc_report *report) {
-  koopmpc_real stage[NS], u_prev[NV];
+  koopmpc_real stage[NS], u_prev[NV], *told = s->known + KOOPMPC_U_PREV;
   koopmpc_status status = KOOPMPC_BAD_MEASUREMENT;
   int conflict, known;
-  koopmpc_copy(u_prev, s->given, NV);
-  if (KOOPMPC_WITH_RATES) {
-    if (koopmpc_usable(s->known + KOOPMPC_U_PREV, NV))
-      koopmpc_copy(u_prev, s->known + KOOPMPC_U_PREV, NV);
-    else
-      koopmpc_copy(s->known + KOOPMPC_U_PREV, u_prev, NV);
-  }
+  koopmpc_copy(u_prev, KOOPMPC_WITH_RATES && koopmpc_usable(told, NV) ? told : s->given, NV);
+  if (KOOPMPC_WITH_RATES) koopmpc_copy(told, u_prev, NV);
   conflict = first_stage(s, u_prev, stage);
   known = koopmpc_usable(s->known, NX) && disturb(s) && aim(s, reference);
   if (known) status = solve(s, stage, u_prev, &report->iterations);

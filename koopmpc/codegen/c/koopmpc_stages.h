@@ -56,19 +56,6 @@ static inline void koopmpc_multiply(koopmpc_real *to, const koopmpc_real *a, con
     }
 }
 
-/** The larger of `most` and |value|; NaN stays. */
-static inline koopmpc_real koopmpc_most(koopmpc_real most, koopmpc_real value) {
-  value = koopmpc_abs(value);
-  return value <= most ? most : value;
-}
-
-/** The largest of |a|. */
-static inline koopmpc_real koopmpc_largest(const koopmpc_real *a, int n) {
-  koopmpc_real most = 0;
-  for (int i = 0; i < n; i++) most = koopmpc_most(most, a[i]);
-  return most;
-}
-
 /** K (n, m) <- H^-1 K by the lower factor of H, which is written to L; 0 if H is not positive definite. */
 static inline int koopmpc_divide(const koopmpc_real *H, koopmpc_real *L, koopmpc_real *K, int n, int m) {
   int good = 1;

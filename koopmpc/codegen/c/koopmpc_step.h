@@ -16,6 +16,19 @@ static inline int koopmpc_usable(const koopmpc_real *a, int n) {
   return good;
 }
 
+/** The larger of `most` and |value|; NaN stays. */
+static inline koopmpc_real koopmpc_most(koopmpc_real most, koopmpc_real value) {
+  value = koopmpc_abs(value);
+  return value <= most ? most : value;
+}
+
+/** The largest of |a|. */
+static inline koopmpc_real koopmpc_largest(const koopmpc_real *a, int n) {
+  koopmpc_real most = 0;
+  for (int i = 0; i < n; i++) most = koopmpc_most(most, a[i]);
+  return most;
+}
+
 static inline koopmpc_real koopmpc_dot(const koopmpc_real *a, const koopmpc_real *b, int n) {
   koopmpc_real sum = 0;
   for (int i = 0; i < n; i++) sum += a[i] * b[i];
