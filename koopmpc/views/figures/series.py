@@ -219,14 +219,7 @@ def error(
     rows = -(-len(chosen) // columns)
     drawing, axes = make_figure(rows, columns, width=width, height=0.7 + 1.35 * rows, sharex=True)
     for panel, i in zip(axes.flat, chosen, strict=False):
-        for j, (name, score) in enumerate(named.items()):
-            ahead = np.arange(1, score.horizon + 1)
-            low, high, rmse = (
-                np.where(np.isfinite(v[:, i]), v[:, i], np.nan) for v in (score.low, score.high, score.rmse)
-            )
-            draw_band(panel, ahead, low, high, j, f"{name} 5 to 95 %".strip())
-            panel.plot(ahead, rmse, **line_style(j, score.horizon), label=f"{name} RMSE".strip())
-        panel.set_xlim(1, max(s.horizon for s in named.values()))
+        _draw_scores(panel, named, i)
         label = fit_label(first.states[i], 1.35)
         panel.set_ylabel(f"error of\n{label['ylabel']}", fontsize=label["fontsize"])
         panel.set_ylim(*_choose_error_axis([_find_extent(score, i) for score in named.values()]))
@@ -239,6 +232,16 @@ def error(
     most = 2 if width == "one column" else 4  # columns of the legend, one for each model
     draw_legend(drawing, axes.flat[:1], 2 if len(named) == 1 else min(len(named), most))
     return drawing
+
+
+def _draw_scores(panel: Any, named: Mapping[str, Score], i: int) -> None:
+    """Draw the errors of state i of each model over the steps ahead."""
+    for j, (name, score) in enumerate(named.items()):
+        ahead = np.arange(1, score.horizon + 1)
+        low, high, rmse = (np.where(np.isfinite(v[:, i]), v[:, i], np.nan) for v in (score.low, score.high, score.rmse))
+        draw_band(panel, ahead, low, high, j, f"{name} 5 to 95 %".strip())
+        panel.plot(ahead, rmse, **line_style(j, score.horizon), label=f"{name} RMSE".strip())
+    panel.set_xlim(1, max(s.horizon for s in named.values()))
 
 
 def _find_extent(score: Score, i: int) -> tuple[float, float]:

@@ -45,7 +45,27 @@ def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
     inputs = _in_order([run.inputs for run in runs])
     if max(sum(name in (*run.states, *run.inputs) for run in runs) for name in (*states, *inputs)) < 2:
         raise LogError(f"the runs of {', '.join(map(str, logs))} have no state and no input in common")
-    drawn = [(f"state/{i}", name, _curves(runs, name, "states", "X")) for i, name in enumerate(states)]
+    drawn, plots = _describe_plots(runs, names, states, inputs)
+    time = shared_time(max(run.steps * run.dt for run in runs))
+    ends = [[c[np.isfinite(c)] for c in curves if c is not None] for *_, curves in drawn]
+    axes = [readable(np.concatenate(values).tolist(), 8.0) for values in ends]
+    layout = rrb.Horizontal(
+        rrb.Vertical(*(plot.view(axis_x=time, axis_y=axis) for plot, axis in zip(plots, axes, strict=True))),
+        rrb.TextDocumentView(origin="metrics", name="Metrics"),
+        column_shares=[1.5, 1.0],  # the table names figures and holds a column a run,
+    )
+    metrics = f"{heading}{_table(runs, names)}"
+    record_plots(path, "koopmpc-comparison", " against ".join(names), plots, layout, metrics=metrics)
+
+
+Drawn = list[tuple[str, str, list[np.ndarray | None]]]  # entity, title, values of each run
+
+
+def _describe_plots(
+    runs: Sequence[Run], names: Sequence[str], states: Sequence[str], inputs: Sequence[str]
+) -> tuple[Drawn, list[Plot]]:
+    """Return what is drawn in each plot: states, inputs, the cost so far; each with its references and limits."""
+    drawn: Drawn = [(f"state/{i}", name, _curves(runs, name, "states", "X")) for i, name in enumerate(states)]
     drawn += [(f"input/{j}", name, _curves(runs, name, "inputs", "U")) for j, name in enumerate(inputs)]
     drawn = drawn[:8]  # plots of states and inputs in one column
     costs = [_cost(run) for run in runs]
@@ -62,16 +82,7 @@ def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
             for r, (name, shade, values, dt) in enumerate(_marks(runs, title))
         ]
         plots.append(Plot(entity, title, series, legend=not plots))
-    time = shared_time(max(run.steps * run.dt for run in runs))
-    ends = [[c[np.isfinite(c)] for c in curves if c is not None] for *_, curves in drawn]
-    axes = [readable(np.concatenate(values).tolist(), 8.0) for values in ends]
-    layout = rrb.Horizontal(
-        rrb.Vertical(*(plot.view(axis_x=time, axis_y=axis) for plot, axis in zip(plots, axes, strict=True))),
-        rrb.TextDocumentView(origin="metrics", name="Metrics"),
-        column_shares=[1.5, 1.0],  # the table names figures and holds a column a run,
-    )
-    metrics = f"{heading}{_table(runs, names)}"
-    record_plots(path, "koopmpc-comparison", " against ".join(names), plots, layout, metrics=metrics)
+    return drawn, plots
 
 
 def _names(runs: Sequence[Run], paths: Sequence[Path]) -> tuple[list[str], str]:

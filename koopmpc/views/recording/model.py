@@ -6,6 +6,7 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.text import format_markdown_table, shorten_observable
 from koopmpc.data.episodes import Episodes
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.validate.bands import Forecast, forecast
+from koopmpc.validate.bands import Bands, Forecast, forecast
 from koopmpc.validate.report import TrustReport
+from koopmpc.validate.residuals import ResidualDMD
 from koopmpc.validate.scoring import AnyPredictor, Score, score
 from koopmpc.views.figures.eigenvalues import Axes, Plane, evaluate_eigenfunctions, make_plane
 from koopmpc.views.figures.style import CYCLIC, SEQUENTIAL, map_colors
@@ -84,13 +86,10 @@ def record_model(
     import rerun as rr
 
     if horizon is None:
-        horizon = min(len(episode) for episode in predictor.embed(episodes)) if report is None else report.score.horizon
-    relift = isinstance(predictor, BilinearPredictor) if report is None else report.band.relift
-    errors = score(predictor, episodes, horizon, relift=relift) if report is None else report.score
-    bands = errors if report is None else report.band
-    count = checks.count(rollouts, "rollouts")
-    ahead = [forecast(predictor, episode, horizon, bands=bands, relift=relift) for episode in list(episodes)[:count]]
-    residuals = None if report is None else report.residuals
+        horizon = min(map(len, predictor.embed(episodes))) if report is None else report.score.horizon
+    errors, bands, residuals, relift = _find_trust(predictor, episodes, horizon, report)
+    chosen = list(episodes)[: checks.count(rollouts, "rollouts")]
+    ahead = [forecast(predictor, episode, horizon, bands=bands, relift=relift) for episode in chosen]
     pictures, surface, note = _pictures(predictor, episodes, report, which, plane, at)
     tabs = {
         f"Forecast of episode {r}": _plot_forecast(predictor, one, f"rollout/{r}") for r, one in enumerate(ahead)
@@ -104,10 +103,23 @@ def record_model(
         log.rec.send_recording_name(drawable(f"model of {', '.join(predictor.states)}"))
         log.page("report", _page(predictor, report, note))
         log.style(Entity.DESCRIPTION, rr.AnyValues(json=json.dumps(about, ensure_ascii=False)))
-        for entity, archetype in [*drawn.items(), *(pair for *_, parts in pictures for pair in parts.items())]:
-            log.style(entity, archetype)
-        for series in (series for plots in tabs.values() for plot in plots for series in plot.series):
-            series.write(log)
+        for parts in (drawn, *(parts for *_, parts in pictures)):
+            for entity, archetype in parts.items():
+                log.style(entity, archetype)
+        for plot in chain.from_iterable(tabs.values()):
+            for series in plot.series:
+                series.write(log)
+
+
+def _find_trust(
+    predictor: AnyPredictor, episodes: Episodes, horizon: int, report: TrustReport | None
+) -> tuple[Score, Bands, ResidualDMD | None, bool]:
+    """Return the errors, the bands and the residuals that are shown, and whether forecasts are lifted anew."""
+    if report is not None:
+        return report.score, report.band, report.residuals, report.band.relift
+    relift = isinstance(predictor, BilinearPredictor)
+    errors = score(predictor, episodes, horizon, relift=relift)
+    return errors, errors, None, relift
 
 
 def _plot_forecast(predictor: AnyPredictor, ahead: Forecast, entity: str) -> list[Plot]:

@@ -50,8 +50,9 @@ def drawing_of(kind: type[Shape] | None, rows: Sequence[Sequence[ColoredShape]],
     """
     import rerun as rr
 
-    shapes: list[Any] = [s for row in rows for s, _ in row]
-    colors = np.array([c for row in rows for _, c in row], dtype=np.uint8).reshape(-1, 3)
+    pairs = list(chain.from_iterable(rows))
+    shapes: list[Any] = [s for s, _ in pairs]
+    colors = np.array([c for _, c in pairs], dtype=np.uint8).reshape(-1, 3)
     radii = np.array([line_radius(s) for s in shapes], dtype=np.float32)
     style = None
     with np.errstate(over="ignore"):
@@ -60,20 +61,25 @@ def drawing_of(kind: type[Shape] | None, rows: Sequence[Sequence[ColoredShape]],
             strips = [(outline(s) * (1.0, -1.0)).astype(np.float32) for s in shapes]  # Rerun's y points down
             even = len({len(strip) for strip in strips}) == 1  # Rerun takes one array faster than a list of arrays
             columns = rr.LineStrips2D.columns(strips=np.stack(strips) if even else strips, radii=radii, colors=colors)
-        elif kind is Line:
-            strips = [outline(s).reshape(-1, 3).astype(np.float32) for s in shapes]
-            columns = rr.LineStrips3D.columns(strips=strips, radii=radii, colors=colors)
-        elif kind is Disk:
-            columns = rr.Points3D.columns(positions=_rows(3, [s.center for s in shapes]), radii=radii, colors=colors)
         else:
-            style = rr.Boxes3D.from_fields(fill_mode="solid")
-            columns = rr.Boxes3D.columns(
-                centers=_rows(3, [s.center for s in shapes]),
-                half_sizes=_rows(3, [s.size for s in shapes]) / 2,
-                quaternions=_rows(4, [find_rotation(s).as_quat() for s in shapes]),
-                colors=colors,
-            )
+            style = rr.Boxes3D.from_fields(fill_mode="solid") if kind is Box else None
+            columns = _columns_in_space(kind, shapes, radii, colors)
     return Drawing(style, columns.partition([len(row) for row in rows]))
+
+
+def _columns_in_space(kind: type[Shape], shapes: list[Any], radii: np.ndarray, colors: np.ndarray) -> Any:
+    """Return the columns of shapes of one kind: lines, balls or boxes."""
+    import rerun as rr
+
+    if kind is Line:
+        strips = [outline(s).reshape(-1, 3).astype(np.float32) for s in shapes]
+        return rr.LineStrips3D.columns(strips=strips, radii=radii, colors=colors)
+    centers = _rows(3, [s.center for s in shapes])
+    if kind is Disk:
+        return rr.Points3D.columns(positions=centers, radii=radii, colors=colors)
+    turns = _rows(4, [find_rotation(s).as_quat() for s in shapes])
+    sizes = _rows(3, [s.size for s in shapes])
+    return rr.Boxes3D.columns(centers=centers, half_sizes=sizes / 2, quaternions=turns, colors=colors)
 
 
 def _rows(n: int, values: Sequence[Any]) -> Float[np.ndarray, "rows n"]:
@@ -181,9 +187,6 @@ class Names:
     def __iter__(self) -> Iterator[str]:
         return iter(self._kinds or {})
 
-    def __len__(self) -> int:
-        return len(self._kinds or {})
-
     def kind(self, name: str) -> type[Shape] | None:
         """Return the kind of shape that a name stands for in space, None in the plane."""
         return self._kinds[name] if self._kinds and 3 in self._coordinates else None
@@ -235,12 +238,15 @@ def _places(shape: Shape) -> Any:
     return (shape.center, shape.size, *([shape.angle] if np.ndim(shape.angle) else []))
 
 
-def draw_layer(names: Names, rows: Sequence[Sequence[ColoredShape]], order: float, step: float = 0.0) -> Drawings:
-    """Return a drawing by name of the shapes of each row, the next name `step` above; an empty row clears it."""
-    return {
-        name: drawing_of(names.kind(name), [[pair for pair in row if pair[0].name == name] for row in rows], order)
-        for name, order in zip(names, order + step * np.arange(len(names)), strict=True)
-    }
+def draw_layer(
+    layer: str, names: Names, rows: Sequence[Sequence[ColoredShape]], order: float, step: float = 0.0
+) -> Drawings:
+    """Return a drawing by entity of the shapes of each row, the next name `step` above; an empty row clears it."""
+    found: Drawings = {}
+    for i, name in enumerate(names):
+        shapes = [[pair for pair in row if pair[0].name == name] for row in rows]
+        found[f"{layer}/{name}"] = drawing_of(names.kind(name), shapes, order + i * step)
+    return found
 
 
 class Scenes:
@@ -262,44 +268,49 @@ class Scenes:
         scene = self.scene
         if scene is None:
             return {}
-        ahead: dict[int, list[list[Shape]]] = {}
-        for k, X, U in plans:
-            if np.isfinite(X).all() and np.isfinite(U).all():
-                later = ((X[i], U[min(i, len(U) - 1)]) for i in stages(len(U)))
-                ahead[k] = [self._names.check(scene(x, u), k) for x, u in later]
-        now: list[list[Shape]] = []
-        aims: list[list[Shape]] = []
-        for i, (x, y, reference) in enumerate(zip(rows.X, rows.Y, rows.reference, strict=True)):
-            self._u = rows.U[i] if i < len(rows.U) else self._u
-            x = y if np.isnan(x).any() and len(y) == len(x) else x
-            shapes = None if self._u is None or not np.isfinite(x).all() else scene(x, self._u)
-            now.append([] if shapes is None else self._names.check(shapes, first + i))
-            aims.append(self._aim(reference, rows.u_reference[min(i, len(rows.U) - 1)], first) if len(rows.U) else [])
-        layers = {"world": draw_layer(self._names, [[(s, s.color) for s in shapes] for shapes in now], 30.0, 1.0)}
+        ahead = {k: self._follow_plan(scene, k, X, U) for k, X, U in plans}
+        now = [self._show(scene, first + i, rows, i) for i in range(len(rows.X))]
+        moves = [rows.u_reference[min(i, len(rows.U) - 1)] for i in range(len(rows.X))] if len(rows.U) else []
+        aims = [self._aim(scene, *aim, first) for aim in zip(rows.reference, moves, strict=False)] or [[] for _ in now]
+        drawings = draw_layer("world", self._names, _paint(now), 30.0, 1.0)
         self.extent.drawn.include([*now, *aims])
-        if ahead or self._ahead:
-            self._ahead = True
+        self._ahead = self._ahead or any(ahead.values())
+        if self._ahead:
             futures = [ahead.get(first + i, []) for i in range(len(now))]
-            self.extent.predicted.include(shapes for row in futures for shapes in row)
-            layers["world/prediction"] = draw_layer(self._names, list(map(_fade_plan, now, futures)), 10.0)
+            self.extent.predicted.include(chain.from_iterable(futures))
+            drawings |= draw_layer("world/prediction", self._names, list(map(_fade_plan, now, futures)), 10.0)
         if any(aims):
             if self.extent.in_space:  # there nothing lies below: a shape at its reference is not drawn twice
                 aims = [[s for s in aim if s not in shapes] for shapes, aim in zip(now, aims, strict=True)]
-            layers["world/reference"] = draw_layer(self._names, [[(s, INK.aim) for s in aim] for aim in aims], 2.0)
-        return {f"{layer}/{name}": drawing for layer, drawn in layers.items() for name, drawing in drawn.items()}
+            drawings |= draw_layer("world/reference", self._names, _paint(aims, INK.aim), 2.0)
+        return drawings
 
-    def _aim(self, reference: np.ndarray, u: np.ndarray, step: int) -> list[Shape]:
+    def _follow_plan(self, scene: Scene, k: int, X: np.ndarray, U: np.ndarray) -> list[list[Shape]]:
+        """Return the shapes of a few stages of a plan; none where a part of it is missing."""
+        if not (np.isfinite(X).all() and np.isfinite(U).all()):
+            return []
+        return [self._names.check(scene(X[i], U[min(i, len(U) - 1)]), k) for i in stages(len(U))]
+
+    def _show(self, scene: Scene, k: int, rows: StepRows, i: int) -> list[Shape]:
+        """Return the shapes of row i at step k, of the measurement where the state is hidden; none without numbers."""
+        self._u = rows.U[i] if i < len(rows.U) else self._u
+        x, y = rows.X[i], rows.Y[i]
+        x = y if np.isnan(x).any() and len(y) == len(x) else x
+        shown = self._u is not None and np.isfinite(x).all()
+        return self._names.check(scene(x, self._u), k) if shown else []
+
+    def _aim(self, scene: Scene, reference: np.ndarray, u: np.ndarray, step: int) -> list[Shape]:
         """Return the shapes at the state that a reference names; none where it names none."""
         key = reference.tobytes()
         if key not in self._targets:
             # states of so many different references are looked for
             self._targets[key] = self._find_target(reference) if len(self._targets) < 2000 else None
         x = self._targets[key]
-        if x is None or self.scene is None:
+        if x is None:
             return []
         key += u.tobytes()
         if key not in self._aims:
-            self._aims[key] = self._names.check(self.scene(x, u), step)
+            self._aims[key] = self._names.check(scene(x, u), step)
         return self._aims[key]
 
     def _find_target(self, reference: Float[np.ndarray, " nr"]) -> Float[np.ndarray, " nx"] | None:
@@ -317,6 +328,11 @@ class Scenes:
         starts = [np.full(len(self._about.states), first) for first in (0.01, 2.0, -2.0)]
         fits = [least_squares(lambda x: lifting(x) - reference, start) for start in starts]
         return min((fit.x for fit in fits if fit.cost < 1e-10), key=lambda x: np.abs(x).sum(), default=None)
+
+
+def _paint(rows: Sequence[Sequence[Shape]], color: Color | None = None) -> list[list[ColoredShape]]:
+    """Return the shapes of each row with this colour, or with their own."""
+    return [[(shape, color or shape.color) for shape in row] for row in rows]
 
 
 def _fade_plan(now: Sequence[Shape], futures: Sequence[Sequence[Shape]]) -> list[ColoredShape]:

@@ -150,19 +150,12 @@ class Writer(RerunLog):
     def _write(
         self, rows: LogBlock, plans: list[tuple[int, np.ndarray, np.ndarray]], drawings: dict[str, Drawing]
     ) -> None:
-        import rerun as rr
-
         k = rows.k + np.arange(len(rows.X))
         looks = styles(self._about, self._nr, self._horizon)
         for entity, look in looks.items():
             if entity != Entity.MEASUREMENT:  # it may have no row
                 self._style(entity, look)
-        if drawings and self._scenes.extent.in_space:
-            self._style("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        for entity, drawing in drawings.items():
-            if drawing.style is not None:
-                self._style(entity, drawing.style)
-            self._send(entity, k, drawing.columns)
+        self._draw(drawings, k)
         if rows.plans is not None:
             self._vectors(Entity.PLAN_STATES, k[: len(rows.U)], rows.plans.X)
             self._vectors(Entity.PLAN_INPUTS, k[: len(rows.U)], rows.plans.U)
@@ -182,6 +175,17 @@ class Writer(RerunLog):
             self._times(k[: len(rows.U)], rows.solve_time)
         self.flush()  # static archetypes reach the file before the states do
         self._vectors(Entity.STATE, k, rows.X, [i for panel in shown for i in panel.states])
+
+    def _draw(self, drawings: dict[str, Drawing], k: np.ndarray) -> None:
+        """Write the animation of the rows at steps k."""
+        import rerun as rr
+
+        if drawings and self._scenes.extent.in_space:
+            self._style("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        for entity, drawing in drawings.items():
+            if drawing.style is not None:
+                self._style(entity, drawing.style)
+            self._send(entity, k, drawing.columns)
 
     def _times(self, k: np.ndarray, seconds: np.ndarray) -> None:
         """Write how long the steps k took, and their deadline, for the plots as powers of ten too."""
