@@ -191,7 +191,8 @@ def check_levels(levels: Any) -> Any:
     """Return levels with an array for each input, None where one has none: two, or evenly spaced ones in order."""
     if isinstance(levels, Mapping) and not levels:
         raise DataError('levels is {}; pass levels by the name of an input, for example {"pump": [0, 1]}')
-    if isinstance(levels, Sequence) and levels and all(isinstance(value, int | float) for value in levels):
+    rows = cast("Sequence[Any]", levels) if isinstance(levels, Sequence) else ()
+    if rows and all(isinstance(row, int | float) for row in rows):
         raise DataError(f"levels is {levels!r}; pass one list for each input, for example [[0, 1]]")
     advice = 'them by name, {"pump": [0, 1]}, or for each input, [[0, 1], None]'
     return _check_each(levels, "levels", advice, _check_values)

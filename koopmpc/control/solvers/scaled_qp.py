@@ -1,3 +1,4 @@
+# pyright: basic
 """ScaledQP: a QP in units of its own, in which DAQP's absolute tolerances are relative ones."""
 
 from collections.abc import Mapping
