@@ -26,8 +26,6 @@ from koopmpc.plants.routines import Buffered
 
 _Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
 
-_FLAT = 1e-24  # b R⁻¹ bᵀ below which no input moves φ
-
 
 class EigenfunctionLQR(FeedbackLaw):
     """u = u_r − R⁻¹ bᵀ k e with e = φ(x) − φ_r, b = β(x) and k = (λ + √(λ² + Q g)) / g, g = b R⁻¹ bᵀ.
@@ -169,7 +167,7 @@ class EigenfunctionLQR(FeedbackLaw):
         b, rate, Q = self._beta(x), self._rate, self._Q
         along = ca.DM(self._R_inverse) @ b.T
         g = b @ along
-        moved = g > _FLAT
+        moved = g > 1e-24  # below, no input moves φ
         size = ca.if_else(moved, g, 1.0)
         root = ca.sqrt(rate**2 + Q * size)
         k = (rate + root) / size if rate > 0 else Q / (root - rate + 1e-300)  # the same, without a difference

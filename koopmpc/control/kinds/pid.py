@@ -27,9 +27,6 @@ from koopmpc.control.step.feedback import FeedbackLaw
 from koopmpc.models.predictors import LinearPredictor
 
 _Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
-_RESPONSE = 20_000  # longest step response that is looked at, in steps
-_SETTLED = 1e-3  # share of its range that the end of a step response may still move
-_OVERSHOOT = 0.05  # overshoot of the step response, as a share of the gain, from which SIMC has no rule
 _CIRCLE = 1e-9  # distance from the unit circle up to which a pole is on it
 
 
@@ -295,8 +292,19 @@ def _find_state(row: Float[np.ndarray, " nz"], C: Float[np.ndarray, "nx nz"]) ->
     raise DataError("the cost tracks an output other than a state; a PID reads measured states: pass of=km.State(…)")
 
 
-def _read_response(model: LinearPredictor, row: Float[np.ndarray, " nz"], j: int) -> StepResponse:
-    """Return the response of an output to a step of input j as first order with delay; the hold adds half a step."""
+def _read_response(
+    model: LinearPredictor,
+    row: Float[np.ndarray, " nz"],
+    j: int,
+    longest: int = 20_000,
+    settled: float = 1e-3,
+    overshoot: float = 0.05,
+) -> StepResponse:
+    """Return the response of an output to a step of input j as first order with delay; the hold adds half a step.
+
+    It has at most `longest` steps. Its end may still move by the share `settled` of its range, and it may pass its end
+    by the share `overshoot`.
+    """
     poles = np.linalg.eigvals(model.A)
     largest = np.sort(np.abs(poles))[::-1]
     constant = bool(np.isclose(poles, 1.0, atol=_CIRCLE).any()) and _holds_constant(model.A)
@@ -306,7 +314,7 @@ def _read_response(model: LinearPredictor, row: Float[np.ndarray, " nz"], j: int
             "rule for it: choose the gains by hand, or use an LQR"
         )
     slowest = -1 / np.log(max(float(largest[int(constant)]), 0.1))
-    steps = min(_RESPONSE, int(np.ceil(10 * slowest)) + 10)
+    steps = min(longest, int(np.ceil(10 * slowest)) + 10)
     z, values = np.zeros(model.nz), np.empty(steps + 1)
     for k in range(steps + 1):
         values[k] = row @ z
@@ -314,10 +322,10 @@ def _read_response(model: LinearPredictor, row: Float[np.ndarray, " nz"], j: int
     gain, span = float(values[-1]), float(np.abs(values).max())
     if not span > 0 or abs(gain) < 1e-9 * span:
         raise DataError(f"input {j} does not move the output for good; a PID cannot hold it with this input")
-    if abs(values[-1] - values[-2]) > _SETTLED * span:
+    if abs(values[-1] - values[-2]) > settled * span:
         raise DataError("the step response of the model does not settle; SIMC has no rule for it")
     shares = values / gain
-    if shares.max() > 1 + _OVERSHOOT:
+    if shares.max() > 1 + overshoot:
         raise DataError(f"the step response overshoots by {100 * (shares.max() - 1):.3g} %; SIMC has no rule for it")
     early, late = (_reach(shares, level) * model.dt for level in (0.283, 0.632))
     slow = max(1.5 * (late - early), model.dt / 2)

@@ -20,8 +20,6 @@ from koopmpc.lifting.state import State
 from koopmpc.plants.routines import Buffered
 
 RANK = 1e-12  # singular values below this share of the largest are rounding; ipopt meets all others too
-BENT = 0.25  # a step is shorter where the cost bends by more than this share beyond its Gauss–Newton part
-LEAST = 0.05  # shortest length of such a step, 1 being the longest
 
 
 class GaussNewtonStep(NamedTuple):
@@ -87,11 +85,14 @@ def invert(E: Float[np.ndarray, "m n"]) -> tuple[Float[np.ndarray, "n m"], Float
     return right[:rank].T @ (left[:, :rank].T / sigma[:rank, None]), right[rank:].T
 
 
-def find_length(last: tuple[np.ndarray, np.ndarray] | None, now: Float[np.ndarray, " n"]) -> float:
+def find_length(
+    last: tuple[np.ndarray, np.ndarray] | None, now: Float[np.ndarray, " n"], bent: float = 0.25, least: float = 0.05
+) -> float:
     """Return the length of a Gauss–Newton step: below 1 where the cost bent more than it knows along the last one.
 
     `last` are the step that was taken and the whole one. From that to `now` it has changed by as much as its slope
-    along the one that was taken tells.
+    along the one that was taken tells. A step is shorter where the cost bends by more than the share `bent` beyond its
+    Gauss–Newton part, and no shorter than `least`.
 
     References
     ----------
@@ -101,7 +102,7 @@ def find_length(last: tuple[np.ndarray, np.ndarray] | None, now: Float[np.ndarra
         return 1.0
     taken, whole = last
     bend, size = float(taken @ (whole - now)), float(taken @ taken)
-    return max(size / bend, LEAST) if bend > (1 + BENT) * size else 1.0
+    return max(size / bend, least) if bend > (1 + bent) * size else 1.0
 
 
 def _find_hit(
@@ -137,7 +138,6 @@ SETTLED = 1e-10  # the last Gauss–Newton step is at most this share of the siz
 CLOSE = 1e-2  # steps below this share of the size of (x, u) leave an error of the square of this share
 SMALL = 1e-7  # weight of (x, u) by their sizes in the residuals: of all equilibria that hold a row the least is found
 MISSED = 1e-6  # share of ‖r‖²_Q that an equilibrium may leave and still hold its row
-_AWAY = 3.0  # standard deviations from the mean of the data, beyond which another equilibrium is looked for
 _QUIET = {
     "print_time": False,
     "ipopt.print_level": 0,
@@ -411,7 +411,7 @@ class Equilibria:
             return 0.0
         center, spread = self.model.cloud
         away = np.abs(x[: len(center)] - center) / np.maximum(spread, 1e-12 * (1 + np.abs(center)))
-        return max(float(away.max()) - _AWAY, 0.0)
+        return max(float(away.max()) - 3.0, 0.0)
 
     def is_nearer(self, exact: Equilibrium, rough: Equilibrium, row: Float[np.ndarray, " nr"]) -> bool:
         """Return whether an equilibrium is close to another one, or a smaller one that holds the row as well."""

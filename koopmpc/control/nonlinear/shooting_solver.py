@@ -22,11 +22,7 @@ from koopmpc.control.solvers.levels import LevelSearch, Relaxed
 from koopmpc.control.step.staged import PlanSolver, PlanStart, StagePlan
 
 Guess = tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]]  # states and inputs
-_HOLD = 5  # steps for which a random guess holds an input
-_WIDE = 1.0  # the range of random inputs where they have no limit
 MOST = 5000  # beginnings of the same length, at most; beyond them nonlinear programs are searched
-_EQUAL = 1e-9  # a sequence is worse than the best one unless it is better by more than this share
-_OUTSIDE = 1e-6  # share of a limit's size by which a hard limit may be missed
 
 
 class ShootingSolver(PlanSolver):
@@ -152,15 +148,18 @@ class ShootingSolver(PlanSolver):
             return relaxed._replace(status=found.status), found.iterations
         return found.answer, found.iterations
 
-    def _guess(self, start: PlanStart) -> list[Begin]:
-        """Return the guesses of a first step: rest at x_0, then where random held inputs lead."""
+    def _guess(self, start: PlanStart, hold: int = 5, wide: float = 1.0) -> list[Begin]:
+        """Return the guesses of a first step: rest at x_0, then where random inputs lead.
+
+        They are held for `hold` steps; without limits they are up to `wide` from rest.
+        """
         N, nu, x = len(start.e), len(start.u_prev), start.s[: self._map.nx]
         rest = np.clip(np.zeros(nu), *self._inputs)
         guesses: list[Guess] = [(np.tile(x, (N + 1, 1)), np.tile(rest, (N, 1)))]
         rng = np.random.default_rng(0)
-        low, high = np.maximum(self._inputs.low, rest - _WIDE), np.minimum(self._inputs.high, rest + _WIDE)
+        low, high = np.maximum(self._inputs.low, rest - wide), np.minimum(self._inputs.high, rest + wide)
         for _ in range(self._nlp.starts - 1):
-            U = np.repeat(rng.uniform(low, high, (-(-N // _HOLD), nu)), _HOLD, axis=0)[:N]
+            U = np.repeat(rng.uniform(low, high, (-(-N // hold), nu)), hold, axis=0)[:N]
             guesses += self._roll_out(start, U)
         return self._list_begins(guesses, start)
 
@@ -216,7 +215,7 @@ class LevelRollouts:
             near = np.clip(guess, root.low, root.high)
             costs, sequences = self._run(s, stages, LevelBox(near, near), most)
             if len(costs) == 1:
-                best, most = sequences[0], float(costs[0]) * (1 - _EQUAL)
+                best, most = sequences[0], float(costs[0]) * (1 - 1e-9)  # what is as good up to rounding is no better
         costs, sequences = self._run(s, stages, root, most if self._problem.stage is None else np.inf)
         if len(costs) and sequences.shape[1] < len(self._blocks):
             return None
@@ -270,7 +269,7 @@ class LevelRollouts:
             cost += _evaluate(p.stage, S, V)[:, 0]
         low, high = (end[k] for end in stages.limits)
         first = stages.first if k == 0 else Interval(low[:nu], high[:nu])
-        reach = _OUTSIDE * p.input_sizes
+        reach = 1e-6 * p.input_sizes  # as limits of inputs are met
         broken = ((first.low - reach > V) | (first.high + reach < V)).any(axis=1)
         if len(p.box.low):
             values, (linear, quadratic, allowance) = _evaluate(p.limited, after), p.softness

@@ -24,8 +24,6 @@ from koopmpc.control.solvers.priorities import weigh_priorities
 from koopmpc.estimate.observer import Estimator
 from koopmpc.plants.step_map import StepMap
 
-_FAR = 1e3  # a row without a limit is this many sizes beyond the widest one, where it limits nothing
-
 
 @dataclass(frozen=True, kw_only=True)
 class StagedTask:
@@ -351,15 +349,15 @@ def find_stage_limits(
     return StageLimits(own, Interval(low, high))
 
 
-def describe_stage_bounds(outputs: StateTracking, problem: StagedProblem) -> StageBounds:
-    """Return how rows of limits become those of the stages."""
+def describe_stage_bounds(outputs: StateTracking, problem: StagedProblem, far: float = 1e3) -> StageBounds:
+    """Return how rows of limits become those of the stages; without a limit, `far` sizes beyond the widest."""
     kept, N = outputs.movable.outputs, len(problem.free)
     count = int(kept.sum())
     return StageBounds(
         outputs=kept,
         margin=problem.margin if problem.margin.shape[1] == count else np.zeros((N, count)),
-        far_inputs=_FAR * outputs.sizes.inputs,
-        far_outputs=_FAR * outputs.sizes.rows[kept],
+        far_inputs=far * outputs.sizes.inputs,
+        far_outputs=far * outputs.sizes.rows[kept],
     )
 
 

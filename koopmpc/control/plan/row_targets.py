@@ -20,10 +20,6 @@ from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.lifting.state import State
 
 PSEUDO = 1e-9  # singular values of the tracked outputs' slopes below this share of the largest count as zero
-_BESIDE = 0.3  # rows are close to each other within this share of a row's size
-_PIECES = 40  # pieces of the way from w = 0 to a measured disturbance, at most
-_PATIENCE = 5  # times as many Gauss–Newton steps at the end of a way in pieces that leads nowhere else
-_MOST = 10_000  # rows kept in memory; it is cleared beyond
 
 
 class TerminalCost(NamedTuple):
@@ -183,8 +179,9 @@ class RowTargets:
     def _move_map(self, w: Float[np.ndarray, " nw"]) -> None:
         self.equilibria.update(self._map.at(w))
 
-    def _keep(self, target: RowTarget) -> None:
-        if len(self._known) > _MOST:
+    def _keep(self, target: RowTarget, most: int = 10_000) -> None:
+        """Keep a target; beyond so many rows the memory is cleared."""
+        if len(self._known) > most:
             self._known.clear()
         self._known[target.row.tobytes(), target.w.tobytes()] = target
 
@@ -220,11 +217,11 @@ class RowTargets:
             return rough
         return exact if self.equilibria.is_nearer(exact, rough, row) else rough
 
-    def _is_beside(self, last: Float[np.ndarray, " nr"], row: Float[np.ndarray, " nr"]) -> bool:
-        """Return whether a row is so close to the last one that its equilibrium is beside that one."""
+    def _is_beside(self, last: Float[np.ndarray, " nr"], row: Float[np.ndarray, " nr"], near: float = 0.3) -> bool:
+        """Return whether a row is within this share of a row's size of the last one: then equilibria are beside."""
         size = self.equilibria.size[: len(row)] if self.equilibria.of_state else np.zeros_like(row)
         way, *sizes = (float(np.linalg.norm(self._outputs.Q_root @ part)) for part in (row - last, row, last, size))
-        return way <= _BESIDE * max(sizes)
+        return way <= near * max(sizes)
 
     def _is_held(self, equilibrium: Equilibrium, row: Float[np.ndarray, " nr"]) -> bool:
         """Return whether an equilibrium holds its row without active limits, among the data: none is better then."""
@@ -234,8 +231,13 @@ class RowTargets:
         missed, size = weight @ (row - of), weight @ row
         return bool(missed @ missed <= MISSED * (1 + size @ size))
 
-    def _move_with(self, w: Float[np.ndarray, " nw"], row: Float[np.ndarray, " nr"]) -> Equilibrium | None:
-        """Return the equilibrium of a row under w, moved there from that of the last step, or of w = 0."""
+    def _move_with(
+        self, w: Float[np.ndarray, " nw"], row: Float[np.ndarray, " nr"], pieces: int = 40, patience: int = 5
+    ) -> Equilibrium | None:
+        """Return the equilibrium of a row under w, moved there from that of the last step, or of w = 0.
+
+        The way from w = 0 has at most so many pieces; at its end there are `patience` times as many steps.
+        """
         equilibria, end = self.equilibria, self._end
         if end is not None and end.is_found and (end.row == row).all() and not end.equilibrium.active.any():
             self._move_map(w)
@@ -243,7 +245,7 @@ class RowTargets:
             if equilibrium is not None and not equilibrium.active.any():
                 return equilibrium
         begin, done, stride = self._find(row, np.zeros_like(w)).equilibrium, 0.0, 1.0
-        for _ in range(_PIECES):
+        for _ in range(pieces):
             share = min(done + stride, 1.0)
             self._move_map(share * w)
             equilibrium = equilibria.near(begin, row, careful=True)
@@ -254,7 +256,7 @@ class RowTargets:
             if done == 1:
                 return equilibrium
         self._move_map(w)
-        equilibrium = equilibria.near(begin, row, careful=True, patience=_PATIENCE)
+        equilibrium = equilibria.near(begin, row, careful=True, patience=patience)
         return self._search_afar(row) if equilibrium is None else equilibrium
 
     def _describe(
