@@ -107,8 +107,7 @@ def read_equations(
         equations = builder.create("unit", ["x", "u"], ["ode", "y"], slopes)
         timed = builder.create("timed", ["t", "x", "u"], ["ode", "y"])  # CasADi 3.8 crashes in its second derivatives
         start, held = (
-            np.array([float(values[name] if name in values else builder.get(name)) for name in group])
-            for group in (names, all_inputs)
+            np.array([float(values.get(name, builder.get(name))) for name in group]) for group in (names, all_inputs)
         )
         _require_autonomous(timed, start, held, unit.file)
         direct = _find_direct_outputs(equations, start, held, len(measured))
@@ -116,20 +115,23 @@ def read_equations(
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise DataError(f"CasADi could not load {unit.file} for model exchange: {lines[-1]}") from error
     if direct:
-        others = [each.name for i, each in enumerate(measured) if i not in direct] or names
+        others = [each.name for i, each in enumerate(measured) if i not in direct]
         raise DataError(
             f"the output {measured[direct[0]].name} of {unit.file} depends on an input directly, but y = h(x); "
-            f"pass outputs={others}"
+            f"pass outputs={others or names}"
         )
     x, u = ca.MX.sym("x", len(names)), ca.MX.sym("u", len(moved))
-    place = {each.name: u[i] for i, each in enumerate(moved)}
-    whole = ca.vertcat(
-        *(place[name] if name in place else ca.MX(value) for name, value in zip(all_inputs, held, strict=True))
-    )
+    whole = _place_inputs(u, [each.name for each in moved], all_inputs, held)
     (slope, _), (_, y) = equations(x, whole), equations(x, ca.DM(held))
     f = ca.Function("f", [x, u], [slope], ["x", "u"], ["dx"])
     h = None if measured == states else ca.Function("h", [x], [y], ["x"], ["y"])
     return UnitEquations(f, h, start, states, moved, measured, values)
+
+
+def _place_inputs(u: ca.MX, moved: list[str], names: list[str], held: np.ndarray) -> ca.MX:
+    """Return the values of all inputs: u of those that are moved, and of the others what is held."""
+    place = {name: u[i] for i, name in enumerate(moved)}
+    return ca.vertcat(*(place.get(name, ca.MX(value)) for name, value in zip(names, held, strict=True)))
 
 
 @cache

@@ -130,8 +130,7 @@ class RowTargets:
         After the deadline no search begins but the first one; a row that is left out has the target of one without an
         equilibrium.
         """
-        targets: list[RowTarget] = []
-        late, searched = False, False
+        targets, late, searched = list[RowTarget](), False, False
         for row in rows:
             known = self._known.get((row.tobytes(), self._w.tobytes()))
             if known is None and searched and perf_counter() > deadline:
@@ -334,14 +333,6 @@ class End(NamedTuple):
     cost: TerminalCost
 
 
-class _Chord(NamedTuple):
-    """The Gauss–Newton step from s₀, and the slopes of the limited values [u; g] there on (x, u) by sizes."""
-
-    s: Float[np.ndarray, " n"]
-    response: Response
-    limited: Float[np.ndarray, "nl n"]
-
-
 class MovingEnd:
     """Row target and e, where x⁺ = F(x, u) + e → End.
 
@@ -357,7 +348,7 @@ class MovingEnd:
     def forget(self) -> None:
         """Begin at the target of the row, for it is of another model or of another w."""
         self._last: Equilibrium | None = None
-        self._chord: _Chord | None = None
+        self._chord: tuple[np.ndarray, Response, np.ndarray] | None = None  # s₀, the step, slopes of [u; g] on s
 
     def at(self, target: RowTarget, e: Float[np.ndarray, " nx"]) -> End:
         """Return the end of a row under e.
@@ -388,11 +379,11 @@ class MovingEnd:
         search, nx = self._targets.equilibria, len(begin.x)
         s, at = np.concatenate([begin.x, begin.u]) / search.size, search.linearise(begin.x, begin.u)
         close = CLOSE * (1 + np.abs(s).max())
-        if self._chord is None or np.abs(s - self._chord.s).max() > close:
+        if self._chord is None or np.abs(s - self._chord[0]).max() > close:
             nu = len(begin.u)
             limited = np.zeros((nu + len(at.G), nx + nu))
             limited[:nu, nx:], limited[nu:, :nx] = np.eye(nu), at.G
-            self._chord = _Chord(s, search.respond(at), limited * search.size)
+            self._chord = s, search.respond(at), limited * search.size
         _, (H, T), limited = self._chord
         step = H @ ((at.F + e - begin.x) / search.size[:nx]) + T @ search.residuals(at, row, s)
         reached = np.concatenate([begin.u, at.g]) + limited @ step
