@@ -291,22 +291,6 @@ def test_machine_code_is_the_interpreter_to_the_bit(monkeypatch: pytest.MonkeyPa
     assert np.array_equal(fast[1], slow[1])
 
 
-def test_what_cannot_be_compiled_is_interpreted() -> None:
-    plant = km.discretize(CartPole(), 0.02, km.plants.CVODES())
-    x, u, x_next = np.array([0.1, 0, 0.2, 0]), np.array([1.0]), np.zeros(4)
-    routine = Routine(plant.F, [x, u], [x_next])
-    routine.call()
-    assert not routine.compiled
-    assert np.allclose(x_next, plant(x, u), rtol=1e-12)
-
-
-def test_arrays_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(AssertionError, match="an array has 2 entries, the function 3"):
-        Routine(function(), [np.zeros(2), np.zeros((20, 3, 3))], [np.zeros((20, 3)), np.zeros(3)])
-    with pytest.raises(AssertionError, match="reads contiguous arrays"):
-        Routine(function(), [np.zeros(6)[::2], np.zeros((20, 3, 3))], [np.zeros((20, 3)), np.zeros(3)])
-
-
 def test_a_quote_without_an_end_names_no_compiler_and_fails_as_a_compiler_does(monkeypatch):
     monkeypatch.setenv("CC", "'gcc")
     assert routines.find_compiler() is None

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.base.errors import DataError, ShapeError
 from tests.gathered import of_loop
 
 COST, LIMITS = km.Cost(Q=[1.0, 0.0], R=0.01), km.Limits(u_min=-2, u_max=2)
@@ -56,7 +55,9 @@ def test_c_code_of_a_plant_with_w_is_refused_in_a_sentence(plant, tmp_path):
     calm = plant.at([0.0, 1.0])
     mpc = km.LinearMPC(calm, [0, 0], [0], COST, LIMITS, 5)
     km.export(mpc, tmp_path / "calm", plant=calm)
-    with pytest.raises(DataError, match=r"measured disturbances, and its C would take u alone; pass plant\.at\(w\)"):
+    with pytest.raises(
+        km.errors.DataError, match=r"measured disturbances, and its C would take u alone; pass plant\.at\(w\)"
+    ):
         km.export(mpc, tmp_path / "windy", plant=plant)
 
 
@@ -174,26 +175,26 @@ def test_estimators_of_the_equations_predict_with_w(plant, estimator):
 def test_what_does_not_fit_is_named(plant):
     mpc = km.NonlinearMPC(plant, COST, LIMITS, 5)
     task = {"x0": [0.0, 0.0], "reference": [0.0, 0.0], "steps": 10}
-    with pytest.raises(DataError, match=r"outside \[K\], wind \[m/s\]\); pass measured="):
+    with pytest.raises(km.errors.DataError, match=r"outside \[K\], wind \[m/s\]\); pass measured="):
         km.simulate(plant, mpc, **task)
-    with pytest.raises(ShapeError, match="measured has 1 columns, the plant 2 disturbances"):
+    with pytest.raises(km.errors.ShapeError, match="measured has 1 columns, the plant 2 disturbances"):
         km.simulate(plant, mpc, measured=[1.0], **task)
-    with pytest.raises(ShapeError, match=r"measured has shape \(7, 2\)"):
+    with pytest.raises(km.errors.ShapeError, match=r"measured has shape \(7, 2\)"):
         km.simulate(plant, mpc, measured=np.zeros((7, 2)), **task)
     W = np.zeros((10, 2))
     W[4, 1] = np.nan
-    with pytest.raises(DataError, match=r"measured holds 1 NaN or inf, the first at \(4, 1\)"):
+    with pytest.raises(km.errors.DataError, match=r"measured holds 1 NaN or inf, the first at \(4, 1\)"):
         km.simulate(plant, mpc, measured=W, **task)
-    with pytest.raises(ShapeError, match="W has shape"):
+    with pytest.raises(km.errors.ShapeError, match="W has shape"):
         plant.rollout([0, 0], np.zeros((5, 1)), np.zeros((4, 2)))
-    with pytest.raises(ShapeError, match="w has shape"):
+    with pytest.raises(km.errors.ShapeError, match="w has shape"):
         plant([0, 0], [0], [1.0])
-    with pytest.raises(DataError, match="pass it to simulate or collect"):
+    with pytest.raises(km.errors.DataError, match="pass it to simulate or collect"):
         km.plants.SimulatedPlant(plant)
     excite = km.Noise(-1, 1)
-    with pytest.raises(DataError, match="pass measured="):
+    with pytest.raises(km.errors.DataError, match="pass measured="):
         km.collect(plant, [0, 0], excite, episodes=1, steps=3)
-    with pytest.raises(ShapeError, match=r"shape \(3,\), expected \(2,\), .* a column for outside"):
+    with pytest.raises(km.errors.ShapeError, match=r"shape \(3,\), expected \(2,\), .* a column for outside"):
         km.collect(plant, [0, 0], excite, episodes=1, steps=3, measured=[1.0, 2.0, 3.0])
-    with pytest.raises(DataError, match="goes with a StepMap"):
+    with pytest.raises(km.errors.DataError, match="goes with a StepMap"):
         km.collect(plant.at([0, 0]), [0, 0], excite, episodes=1, steps=3, measured=[1.0])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from tests.example_plants import CartPole, Spring
+from tests.example_plants import CartPole
 
 MAP = km.discretize(CartPole(), 0.05)
 
@@ -10,12 +10,7 @@ MAP = km.discretize(CartPole(), 0.05)
 def test_a_simulated_plant_is_a_plant_with_the_maps_names():
     plant = km.plants.SimulatedPlant(MAP)
     assert isinstance(plant, km.plants.Plant)
-    assert (plant.dt, plant.states, plant.inputs, plant.outputs) == (
-        0.05,
-        MAP.states,
-        MAP.inputs,
-        MAP.outputs,
-    )
+    assert (plant.dt, plant.states, plant.inputs, plant.outputs) == (0.05, MAP.states, MAP.inputs, MAP.outputs)
 
 
 def test_it_walks_the_rollout():
@@ -31,14 +26,6 @@ def test_a_disturbance_is_added_to_the_next_state():
     assert w.tolist() == [0.1, -0.2, 0.3, 0.4]
 
 
-def test_it_measures_through_h():
-    plant = km.plants.SimulatedPlant(km.discretize(Spring(), 0.1))
-    assert plant.reset([1.0, 2.0], 0).tolist() == [2.0, 5.0]
-    y = plant.step([])
-    assert plant.state is not None
-    assert y.tolist() == [plant.state[1], plant.state[0] + 2 * plant.state[1]]
-
-
 def test_nothing_is_shared_with_the_caller():
     plant, x0 = km.plants.SimulatedPlant(MAP), np.array([0.0, 0.3, 0.0, 0.0])
     y = plant.reset(x0, 0)
@@ -51,14 +38,6 @@ def test_nothing_is_shared_with_the_caller():
     assert after.tolist() == MAP([0.0, 0.3, 0.0, 0.0], [0.0]).tolist()
     after[:] = 9
     assert plant.step([0.0])[0] != 9
-
-
-def test_reset_starts_again():
-    plant = km.plants.SimulatedPlant(MAP)
-    plant.reset([0, 0.3, 0, 0], 0)
-    first = plant.step([1.0]).tolist()
-    plant.reset([0, 0.3, 0, 0], 0)
-    assert plant.step([1.0]).tolist() == first
 
 
 def test_mistakes_are_named():
