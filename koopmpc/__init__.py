@@ -137,6 +137,7 @@ else:
             "loop.simulate",
         ),
         joints={
+            "files of episodes": ("data.files.load",),
             "log formats": (
                 "data.files.npz",
                 "data.files.parquet",

@@ -72,13 +72,7 @@ class Delay(Value):
         return replace(self, bound=(tuple(states), tuple(inputs)))
 
     def match(self, states: Sequence[str], inputs: Sequence[str]) -> "Delay":
-        """Return the copy for data with these names; a bound one keeps only the past of its own inputs.
-
-        Raises
-        ------
-        DataError
-            It is bound to another plant.
-        """
+        """Return the copy for data with these names; a bound one keeps only the past of its own inputs."""
         if self.bound is None:
             return self.bind(states, inputs)
         if self.bound != (tuple(states), tuple(inputs)[: len(self.bound[1])]):

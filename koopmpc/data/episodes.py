@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from math import isclose
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.lazy import load_joint
 from koopmpc.base.values import Named, Value, freeze
 
 
@@ -326,9 +327,7 @@ class Episodes(Named, Value):
         LogError
             The path cannot be written.
         """
-        from koopmpc.data.files.load import save_episodes  # readers build Episodes, so it imports this file
-
-        save_episodes(self, path)
+        _call_files("save", self, path)
 
     @classmethod
     def from_frame(
@@ -370,19 +369,14 @@ class Episodes(Named, Value):
         >>> km.Episodes.from_frame(frame).dt
         0.1
         """
-        from koopmpc.data.files.columns import TableSettings
-        from koopmpc.data.files.frames import read_frame  # readers build Episodes, so they import this file
-
-        return read_frame(frame, TableSettings(dt, states, inputs, disturbances, resample), by, time)
+        return _call_files("read_frame", frame, by, time, (dt, states, inputs, disturbances, resample))
 
     def to_frame(self) -> Any:
         """Return a pandas.DataFrame with episode, step, time [s] and all signals, which `from_frame` reads back.
 
         The inputs of an episode's last row are NaN: none was applied there.
         """
-        from koopmpc.data.files.frames import build_frame, list_columns
-
-        return build_frame(list_columns(self))
+        return _call_files("build_frame", self)
 
     def with_inputs_advanced(self, rows: int = 1) -> "Episodes":
         """Return the episodes with u_{k+rows} beside x_k, for logs whose input column is written `rows` rows late.
@@ -408,14 +402,21 @@ class Episodes(Named, Value):
         return Episodes(episodes, self.dt, self.states, self.inputs, self.disturbances)
 
 
-def episodes_of(given: object) -> Episodes:
-    """Return `given` if it is Episodes.
+_FILES: dict[str, Callable[..., Any]] = {}
 
-    Raises
-    ------
-    DataError
-        It is something else.
-    """
+
+def register_files(**functions: Callable[..., Any]) -> None:
+    """Have `Episodes` call these to save, read_frame and build_frame: files build Episodes, so they import this one."""
+    _FILES.update(functions)
+
+
+def _call_files(name: str, *arguments: Any) -> Any:
+    load_joint("files of episodes", until=lambda: name in _FILES)
+    return _FILES[name](*arguments)
+
+
+def episodes_of(given: object) -> Episodes:
+    """Return `given` if it is Episodes."""
     if isinstance(given, Episodes):
         return given
     raise explain_wrong_data(given, "or what collect returns")

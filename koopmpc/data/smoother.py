@@ -226,13 +226,7 @@ class _Passage(NamedTuple):
 def _state_space(
     data: Episodes, mean: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"], *, products: bool = True
 ) -> StateSpace:
-    """Return the model of episodes without disturbances: of 0, 1 and 2 delays the fewest that are within 5 %.
-
-    Raises
-    ------
-    DataError
-        As `Smoother.of`.
-    """
+    """Return the model of episodes without disturbances: of 0, 1 and 2 delays the fewest that are within 5 %."""
     windows = _windows(data, mean, scale)
     pairs = windows.U.shape[0] * windows.U.shape[1]
     fits: list[tuple[float, StateSpace]] = []

@@ -142,13 +142,7 @@ class Changed(Source):
 
 
 def source_of(given: object) -> Source:
-    """Return `given` if it is a Source, or Episodes as a source of one part.
-
-    Raises
-    ------
-    DataError
-        It is something else.
-    """
+    """Return `given` if it is a Source, or Episodes as a source of one part."""
     if isinstance(given, Episodes):
         return Held(given)
     if isinstance(given, Source):

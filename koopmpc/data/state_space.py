@@ -1,18 +1,28 @@
 """Filter, smoother and expectation–maximisation of the state-space model behind `Smoother`, states in unit variance."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 DELAYS = (0, 1, 2)  # past steps that a model may have
-_ITERATIONS = 40
-_FEWEST = 10
-_GAIN = 2.0  # of the log-likelihood in one iteration; with less the fit ends
-_LEAST = 1e-10  # variance of either noise
-_ROUNDING = 1e-13  # added to variances before they are inverted
-_ROUND = 1e-6  # least share of a variance that is not rounding
-_SETTLED = 1e-12  # change of a variance from step to step after which the gains stay
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """Limits of the fit of the smoother's model."""
+
+    iterations: int = 40  # of expectation–maximisation, at most
+    fewest: int = 10  # iterations, at least
+    gain: float = 2.0  # of the log-likelihood in one iteration; with less the fit ends
+    least: float = 1e-10  # variance of either noise
+    rounding: float = 1e-13  # added to variances before they are inverted
+    round: float = 1e-6  # least share of a variance that is not rounding
+    settled: float = 1e-12  # change of a variance from step to step after which the gains stay
+
+
+_LIMITS = _Limits()
 
 
 class StateSpace(NamedTuple):
@@ -85,10 +95,10 @@ def gains_of(model: StateSpace, length: int) -> SmootherGains:
         ahead = onward[-1] @ F.T + V
         ahead = (ahead + ahead.T) / 2
         aheads.append(ahead)
-        if k > 0 and np.abs(ahead - result.before[-1]).max() < _SETTLED:
+        if k > 0 and np.abs(ahead - result.before[-1]).max() < _LIMITS.settled:
             break
         P = ahead
-    back = np.linalg.solve(np.array(aheads) + _ROUNDING * one, np.array(onward))
+    back = np.linalg.solve(np.array(aheads) + _LIMITS.rounding * one, np.array(onward))
     result.back.extend(back.transpose(0, 2, 1))
     return result
 
@@ -160,7 +170,7 @@ def left_out(
     for steps in np.unique(given.last):
         own = np.array([np.diag(P) for P in _covariances(gains, int(steps) + 1 - d)[0]])
         first = own[0].reshape(d + 1, nx)[:0:-1]
-        free = np.maximum(1 - np.concatenate([first, own[:, :nx]]) / model.R, _ROUND)
+        free = np.maximum(1 - np.concatenate([first, own[:, :nx]]) / model.R, _LIMITS.round)
         of = given.last == steps
         gap[of, : steps + 1] /= free
         gap[of, steps + 1 :] = 0.0
@@ -183,13 +193,13 @@ def fit_state_space(given: Stretches, delays: int, *, products: bool) -> tuple[f
     rows, ahead = _rows(S, D), S[:, 1:, :nx].reshape(-1, nx)
     K = np.linalg.lstsq(rows, ahead, rcond=1e-9)[0]
     missed = ahead - rows @ K
-    V = missed.T @ missed / (2 * len(rows)) + _LEAST * np.eye(nx)  # half of it is noise, for a start
+    V = missed.T @ missed / (2 * len(rows)) + _LIMITS.least * np.eye(nx)  # half of it is noise, for a start
     model = model._replace(K=K, V=V, R=np.diag(V) / 2)
     reached: list[float] = []
-    for _ in range(_ITERATIONS):
+    for _ in range(_LIMITS.iterations):
         model, likelihood, D = _improve(model, given, D)
         reached.append(likelihood)
-        if len(reached) > _FEWEST and reached[-1] < reached[-2] + _GAIN:
+        if len(reached) > _LIMITS.fewest and reached[-1] < reached[-2] + _LIMITS.gain:
             break
     numbers = X.shape[0] * (X.shape[1] - 1 - max(DELAYS)) * nx
     return reached[-1] / numbers, model
@@ -224,11 +234,11 @@ def _improve(
     K = np.linalg.solve(square + weight, cross)
     V = ahead.T @ ahead + E * total[1:, :nx, :nx].sum(axis=0) - K.T @ cross - cross.T @ K + K.T @ square @ K
     sizes, axes = np.linalg.eigh((V + V.T) / (2 * len(rows)))
-    V = (axes * np.maximum(sizes, _LEAST)) @ axes.T
+    V = (axes * np.maximum(sizes, _LIMITS.least)) @ axes.T
     left = np.sum((X - unstack_delays(S, d, nx)) ** 2, axis=(0, 1))
     own = np.diagonal(total, axis1=1, axis2=2)
     left += E * (own[:, :nx].sum(axis=0) + own[0, nx:].reshape(d, nx).sum(axis=0))
-    better = model._replace(K=K, V=V, R=left / (E * X.shape[1]) + _LEAST)
+    better = model._replace(K=K, V=V, R=left / (E * X.shape[1]) + _LIMITS.least)
     return better, float(likelihood), D
 
 

@@ -15,19 +15,26 @@ from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.lifting.base import strip_unit
 from koopmpc.validate.logs.log import Log, solve_weights
 
-SURE = 5.0  # a change must be this many times its spread among parts of the old data
-LEAST = 0.1  # smaller changes than this share are not named
-ASKED = 0.2  # where a change of this share would not be seen, nobody can say
-ALIKE = 0.1  # coefficients that explain this share less than the best explanation cannot be told from it
-ALIKE_GAIN = 0.25  # gains of inputs and sensors may explain this share less: they are the commoner cause
-_CLOSE = 12.0  # nor can those that explain so much less in twice the log-likelihood
-_BLOCKS = 8  # parts of the old data that are compared with the others
-_INSIDE = 0.995  # share of the old rows whose leverage counts as inside the data
-_FEWEST = 40  # rows inside the old data that a comparison needs
-_NUDGE = 1e-3  # relative step of the differences
-_PART = 0.5  # a name should explain this share of what changed
-_TOO_LITTLE = 1 / 3  # one that explains less than this is not named: the regression itself may not hold there
 
+@dataclass(frozen=True)
+class _Limits:
+    """Limits of the comparison of new logs with old data."""
+
+    sure: float = 5.0  # a change must be this many times its spread among parts of the old data
+    least: float = 0.1  # smaller changes than this share are not named
+    asked: float = 0.2  # where a change of this share would not be seen, nobody can say
+    alike: float = 0.1  # coefficients that explain this share less than the best explanation cannot be told from it
+    alike_gain: float = 0.25  # gains of inputs and sensors may explain this share less: they are the commoner cause
+    close: float = 12.0  # nor can those that explain so much less in twice the log-likelihood
+    blocks: int = 8  # parts of the old data that are compared with the others
+    inside: float = 0.995  # share of the old rows whose leverage counts as inside the data
+    fewest: int = 40  # rows inside the old data that a comparison needs
+    nudge: float = 1e-3  # relative step of the differences
+    part: float = 0.5  # a name should explain this share of what changed
+    too_little: float = 1 / 3  # one that explains less than this is not named: the regression itself may not hold there
+
+
+_LIMITS = _Limits()
 TOLERANCE = 1.5  # errors may be this many times those of a model on its own data before it counts as changed
 CHANCE = 1e-5  # or so large that chance makes them so in this share of cases
 PAIRED = 1.5  # sensor noise e_k = v_{k+1} − A v_k makes neighbours alike: n errors tell as much as n / 1.5 at least
@@ -154,14 +161,14 @@ def find_drift(old: Episodes, new: Episodes) -> DriftReport:
     law = _Law.of(old)
     inside = [law.is_inside(e.X[:-1], e.U) for e in new]
     count, total = int(sum(np.sum(one) for one in inside)), sum(map(len, new))
-    if count < _FEWEST:
+    if count < _LIMITS.fewest:
         return DriftReport(
             "cannot say",
             (),
             (),
             total,
             count,
-            (f"{count} of {total} new rows are inside the old data, {_FEWEST} are needed: nothing is compared",),
+            (f"{count} of {total} new rows are inside the old data, {_LIMITS.fewest} are needed: nothing is compared",),
         )
     parts = [(e.X[:-1][one], e.U[one], e.X[1:][one]) for e, one in zip(new, inside, strict=True) if one.sum() > 1]
     blocks = list(_cut_blocks(old))
@@ -172,7 +179,7 @@ def find_drift(old: Episodes, new: Episodes) -> DriftReport:
 
 def _cut_blocks(data: Episodes) -> Iterator["_Rows"]:
     """Yield parts of the data as long as others, episode by episode."""
-    length = max(sum(map(len, data)) // _BLOCKS, 10)
+    length = max(sum(map(len, data)) // _LIMITS.blocks, 10)
     kept: list[_Rows] = []
     for e in data:
         for k in range(0, len(e), length):
@@ -240,7 +247,7 @@ class _Law:
                 S += np.diag(np.maximum(1e-4 * size, floor) ** 2)
                 root = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
                 whitener = np.ascontiguousarray(np.asarray(np.linalg.inv(root), dtype=np.float64).T)
-                bound = float(np.quantile(leverage, _INSIDE))
+                bound = float(np.quantile(leverage, _LIMITS.inside))
                 best, least = cls(log, rich, theta, gram, cross, whitener, bound), value
         if best is None:
             raise DataError("the old data have too few rows for a regression; pass the logs of the design as a whole")
@@ -286,19 +293,19 @@ class _Law:
 
     def directions(self, X: Float[np.ndarray, "n nx"], U: Float[np.ndarray, "n nu"]) -> Float[np.ndarray, "c n nx"]:
         """Return how the predictions move with a relative change of each candidate."""
-        base, more = self.predict(X, U), 1 + _NUDGE
+        base, more = self.predict(X, U), 1 + _LIMITS.nudge
         nx, nu = X.shape[1], U.shape[1]
         found: list[np.ndarray] = []
         for j in range(nu):
             V = U.copy()
             V[:, j] *= more
-            found.append((self.predict(X, V) - base) / _NUDGE)
+            found.append((self.predict(X, V) - base) / _LIMITS.nudge)
         for i in range(nx):
             Y = X.copy()
             Y[:, i] /= more
             moved = self.predict(Y, U)
             moved[:, i] *= more
-            found.append((moved - base) / _NUDGE)
+            found.append((moved - base) / _LIMITS.nudge)
         middle, centre = self.log.center[None], self.log.input_center[None]
         for i in range(nx):
             for k in range(nx + nu):
@@ -351,10 +358,14 @@ def _judge(law: _Law, found: _Measured, null: Sequence[_Measured], rows: int, in
     scatter = np.sqrt(np.mean([(one.size / one.error) ** 2 for one in null], axis=0))
     spread = np.sqrt(np.mean([one.size**2 for one in null], axis=0))
     inflate = np.maximum(scatter, 1.0)
-    error = np.maximum(found.error * inflate, np.minimum(spread, found.error * inflate * np.sqrt(_BLOCKS)))
+    error = np.maximum(found.error * inflate, np.minimum(spread, found.error * inflate * np.sqrt(_LIMITS.blocks)))
     sure, names = found.size / error, law.names
-    unseen = [i for i in range(len(names)) if SURE * error[i] > ASKED]
-    changed = [i for i in range(len(names)) if abs(sure[i]) >= SURE and abs(found.size[i]) >= LEAST and i not in unseen]
+    unseen = [i for i in range(len(names)) if _LIMITS.sure * error[i] > _LIMITS.asked]
+    changed = [
+        i
+        for i in range(len(names))
+        if abs(sure[i]) >= _LIMITS.sure and abs(found.size[i]) >= _LIMITS.least and i not in unseen
+    ]
     gains = range(law.log.data.nu)
     said: list[str] = []
     if inside < rows:
@@ -370,23 +381,28 @@ def _judge(law: _Law, found: _Measured, null: Sequence[_Measured], rows: int, in
     scaled = found.gain / inflate**2
     best = max(changed, key=lambda i: float(scaled[i]))
     part = float(found.gain[best] / max(found.whole, 1e-300))
-    if part < _TOO_LITTLE:
+    if part < _LIMITS.too_little:
         first = (
             "the new logs differ from the law of the old data, and no single change explains a third of it: more than "
             "one thing changed, or the law is not well known where the new rows lie"
         )
         return DriftReport("cannot say", (), missed, rows, inside, (first, *said))
     single = law.log.data.nu + law.log.data.nx  # gains stand first among the candidates
-    share = np.where(np.arange(len(names)) < single, ALIKE_GAIN, ALIKE)
-    near = [i for i in changed if scaled[i] >= scaled[best] - max(_CLOSE, float(share[i] * scaled[best]))]
+    share = np.where(np.arange(len(names)) < single, _LIMITS.alike_gain, _LIMITS.alike)
+    near = [i for i in changed if scaled[i] >= scaled[best] - max(_LIMITS.close, float(share[i] * scaled[best]))]
     near.sort(key=lambda i: (i >= single, -float(scaled[i])))
     chosen = tuple(
         PlantChange(
-            names[i], float(found.size[i]), float(sure[i]), float(SURE * error[i]), float(found.gain[i]), law.kinds[i]
+            names[i],
+            float(found.size[i]),
+            float(sure[i]),
+            float(_LIMITS.sure * error[i]),
+            float(found.gain[i]),
+            law.kinds[i],
         )
         for i in near
     )
     first = str(chosen[0]) if len(chosen) == 1 else " or ".join(map(str, chosen)) + ": these cannot be told apart"
-    if part < _PART:
+    if part < _LIMITS.part:
         said.append(f"it explains {to_percent(part)} of what changed: more than one thing did")
     return DriftReport("changed", chosen, missed, rows, inside, (first, *said))

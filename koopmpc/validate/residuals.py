@@ -164,15 +164,7 @@ def _column_norms(columns: np.ndarray) -> Float[np.ndarray, " n"]:
 
 
 def check_residuals(predictor: AnyPredictor, residuals: "ResidualDMD | ArrayLike") -> ResidualDMD:
-    """Return the residuals as a ResidualDMD; an array is in the order of ``predictor.eigenvalues``.
-
-    Raises
-    ------
-    ShapeError
-        The number of residuals differs from the number of eigenvalues.
-    DataError
-        A residual is negative or NaN, or the residuals belong to another predictor.
-    """
+    """Return the residuals as a ResidualDMD; an array is in the order of ``predictor.eigenvalues``."""
     if isinstance(residuals, ResidualDMD):
         if len(residuals.residuals) != predictor.nz:
             raise ShapeError(

@@ -51,14 +51,6 @@ def test_letters_of_another_encoding(tmp_path: Path) -> None:
     assert read.states == ("é",)
 
 
-def test_what_is_told_counts(tmp_path: Path) -> None:
-    file = text(tmp_path / "log.csv", "a,b,w,u1\n1,2,3,4\n5,6,7,8\n")
-    read = km.load_episodes(file, dt=0.5, states=["u1"], inputs=["a"], disturbances=["b"])
-    assert (read.states, read.inputs, read.disturbances, read.dt) == (("u1",), ("a",), ("b",), 0.5)
-    guessed = km.load_episodes(file, dt=0.5)
-    assert (guessed.states, guessed.inputs, guessed.disturbances) == (("a", "b"), ("u1",), ("w",))
-
-
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(5, 40), st.sets(st.integers(0, 39), max_size=6), st.sets(st.integers(0, 39), max_size=4))
 def test_gaps_cut_and_no_pair_spans_one(tmp_path: Path, T: int, holes: set[int], late: set[int]) -> None:
@@ -108,17 +100,6 @@ def test_unequal_time_is_named_and_resampled(tmp_path: Path) -> None:
     assert np.allclose(episode.X[:, 0], 2 * grid - 1, atol=1e-12)  # a straight line is its own interpolation
     held = np.searchsorted(t, grid[:-1] + 1e-9, side="right") - 1
     assert episode.U[:, 0].tolist() == held.tolist()
-
-
-def test_columns_that_say_nothing_are_named(tmp_path: Path) -> None:
-    file = text(tmp_path / "log.csv", "t,x,y,c,u\n0,1,1,7,1\n1,2,2,7,0\n2,4,4,7,1\n")
-    with pytest.warns(km.FitWarning) as caught:
-        km.load_episodes(file)
-    said = [str(w.message) for w in caught]
-    assert any("'y' repeats 'x'; leave one out" in s for s in said)
-    assert any("'c' is 7 throughout; leave it out" in s for s in said)
-    with pytest.warns(km.FitWarning, match="no column is named as an input, .* its states are x, y; pass inputs="):
-        km.load_episodes(text(tmp_path / "free.csv", "t,x,y\n0,1,5\n1,2,3\n"))
 
 
 def test_the_index_that_pandas_writes_is_no_state_and_a_clock_of_another_name_is_told(tmp_path: Path) -> None:
@@ -272,11 +253,6 @@ def test_a_cell_that_is_no_number_costs_no_column_in_silence(tmp_path: Path, spo
     with pytest.raises(km.errors.DataError, match=said):
         km.load_episodes(file, states=["x", "v"], inputs=["u"])
     assert km.load_episodes(file, states=["v"], inputs=["u"]).states == ("v",)
-
-
-def test_complex_cells_are_not_left_out_in_silence(tmp_path: Path) -> None:
-    with pytest.raises(km.errors.DataError, match=r"'x' holds '\(1\+2j\)' in row 1, which is not a real number"):
-        km.load_episodes(table(tmp_path, ["(1+2j)", "(2+1j)", "(3-1j)"]))
 
 
 def test_a_column_of_labels_is_no_state(tmp_path: Path) -> None:

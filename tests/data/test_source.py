@@ -102,19 +102,6 @@ def test_the_path_must_be_there_and_hold_episodes(tmp_path: Path) -> None:
         km.data.Files([])
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".parquet"])
-def test_an_empty_file_is_named(tmp_path: Path, suffix: str) -> None:
-    folder_of(tmp_path, sets(2), suffix)
-    (tmp_path / f"1{suffix}").write_bytes(b"")
-    source = km.data.Files(tmp_path)
-    with pytest.raises(km.errors.LogError, match=rf"{tmp_path}/1\{suffix}"):
-        read(source)
-    (tmp_path / f"0{suffix}").write_bytes(b"")
-    (tmp_path / f"1{suffix}").unlink()
-    with pytest.raises(km.errors.LogError, match=rf"{tmp_path}/0\{suffix}"):
-        km.data.Files(tmp_path)
-
-
 def ragged(path: Path) -> km.Episodes:
     if path.name == "1.npz":
         raise km.errors.ShapeError("U has 3 rows and X 9")

@@ -115,17 +115,6 @@ def test_no_pickle_is_opened(tmp_path: Path) -> None:
         km.load_episodes(tmp_path / "evil.npz")
 
 
-def test_a_file_with_nan_says_so(tmp_path: Path) -> None:
-    file = tmp_path / "data.npz"
-    random_episodes([2], 1, 1, 0).save(file)
-    with np.load(file) as held:
-        arrays = dict(held)
-    arrays["X"][1] = np.nan
-    np.savez(file, **arrays)
-    with pytest.raises(km.errors.LogError, match="X holds 1 NaN or inf"):
-        km.load_episodes(file)
-
-
 def test_other_suffixes_and_taken_names_are_refused(tmp_path: Path) -> None:
     data = random_episodes([2], 1, 1, 0)
     with pytest.raises(km.errors.DataError, match=r"in .npz, .parquet, .csv files, not in 'data.xyz'; rename it"):

@@ -112,17 +112,6 @@ def test_a_file_of_koopmpc_is_told_nothing(tmp_path: Path) -> None:
             km.load_episodes(tmp_path / name, dt=0.1)
 
 
-def test_a_cut_table_is_refused(tmp_path: Path) -> None:
-    file = written(tmp_path / "own.parquet", x=np.arange(100.0), u=np.arange(100.0))
-    whole = file.read_bytes()
-    for kept in range(0, len(whole), len(whole) // 20):
-        file.write_bytes(whole[:kept])
-        with pytest.raises(
-            km.errors.LogError, match=r"own\.parquet holds no episodes that can be read: it is no \.parquet"
-        ):
-            km.load_episodes(file, **TOLD)
-
-
 @pytest.mark.parametrize("start", [0.0, 0.1, 0.3, 1e3, 1.7e6])
 @pytest.mark.parametrize("dt", [0.1, 0.01, 1 / 3])
 def test_a_log_on_the_grid_that_is_asked_for_is_resampled_to_itself(tmp_path: Path, start: float, dt: float) -> None:

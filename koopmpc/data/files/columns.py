@@ -55,13 +55,7 @@ class TableSettings:
         return all(value is None for value in vars(self).values())
 
     def rename(self, names: Sequence[str], where: str) -> list[str]:
-        """Return the names of all columns after `columns`; a mapped name without a unit keeps the unit of the old one.
-
-        Raises
-        ------
-        DataError
-            There are more or fewer names than columns, or a column to rename is not there.
-        """
+        """Return the names of all columns after `columns`; a mapped name without a unit keeps that of the old one."""
         if self.columns is None:
             return list(names)
         if not isinstance(self.columns, Mapping):

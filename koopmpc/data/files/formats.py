@@ -156,13 +156,7 @@ def list_suffixes(*, writable: bool = False, folders: bool = False) -> list[str]
 
 
 def find_format(file: Path, *, writable: bool = False) -> LogFormat:
-    """Return the format of a file by its suffix.
-
-    Raises
-    ------
-    DataError
-        No format has this suffix, or it cannot be written.
-    """
+    """Return the format of a file by its suffix."""
     suffix = file.suffix.lower()
     load_joint(_JOINT, until=lambda: suffix in _FORMATS)
     log_format = _FORMATS.get(suffix)
@@ -173,15 +167,7 @@ def find_format(file: Path, *, writable: bool = False) -> LogFormat:
 
 
 def read_log(file: Path) -> Episodes | LogTable | Recording:
-    """Return what the reader of the file's format makes of it.
-
-    Raises
-    ------
-    LogError
-        The file is missing or damaged, or a package that its format needs is not installed.
-    DataError
-        No format has its suffix.
-    """
+    """Return what the reader of the file's format makes of it."""
     log_format = find_format(file)
     disk.existing(file, ADVICE)
     try:

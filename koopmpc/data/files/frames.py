@@ -27,13 +27,7 @@ def is_frame(given: object) -> bool:
 
 
 def read_frame(frame: Any, settings: TableSettings, by: str | None = None, time: str | None = None) -> Episodes:
-    """Return the episodes of a DataFrame; `Episodes.from_frame` says what the columns mean.
-
-    Raises
-    ------
-    DataError
-        It is no DataFrame, or has no column `by` or `time`; else as a table of a file.
-    """
+    """Return the episodes of a DataFrame; `Episodes.from_frame` says what the columns mean."""
     if not is_frame(frame):
         raise DataError(f"frame is {checks.article(frame)}; pass a pandas.DataFrame")
     names = [str(name) for name in frame.columns]
@@ -57,13 +51,7 @@ def read_frame(frame: Any, settings: TableSettings, by: str | None = None, time:
 
 
 def build_frame(columns: dict[str, Any]) -> Any:
-    """Return a DataFrame of these columns.
-
-    Raises
-    ------
-    KoopmpcError
-        pandas is not installed.
-    """
+    """Return a DataFrame of these columns."""
     try:
         import pandas as pd
     except ModuleNotFoundError as error:

@@ -7,10 +7,10 @@ from typing import Any
 
 from koopmpc.base import disk
 from koopmpc.base.errors import DataError
-from koopmpc.data.episodes import Episodes, PlantSignature, join_sets
+from koopmpc.data.episodes import Episodes, PlantSignature, join_sets, register_files
 from koopmpc.data.files.columns import TableSettings
 from koopmpc.data.files.formats import LogTable, find_format, read_log
-from koopmpc.data.files.frames import is_frame, read_frame
+from koopmpc.data.files.frames import build_frame, is_frame, list_columns, read_frame
 from koopmpc.data.files.notes import join_warnings
 from koopmpc.data.files.recording import read_recording
 from koopmpc.data.files.tables import read_table
@@ -82,13 +82,7 @@ def load_episodes(
 
 
 def load_alike(files: Sequence[str | PathLike[str]], like: Episodes) -> Episodes:
-    """Read files as one set, tables with the names and the sample time of other episodes of the same plant.
-
-    Raises
-    ------
-    LogError, DataError
-        As `load_episodes` does.
-    """
+    """Read files as one set, tables with the names and the sample time of other episodes of the same plant."""
     return _load(files, TableSettings(like.dt, like.states, like.inputs), own=True)
 
 
@@ -123,3 +117,10 @@ def _load_file(file: Any, settings: TableSettings, own: bool) -> Episodes:
     if not own and not settings.nothing:
         raise DataError(f"{file} holds its own names and dt; leave out dt, states and inputs")
     return content
+
+
+register_files(
+    save=save_episodes,
+    read_frame=lambda frame, by, time, told: read_frame(frame, TableSettings(*told), by, time),
+    build_frame=lambda episodes: build_frame(list_columns(episodes)),
+)

@@ -41,13 +41,7 @@ def write_npz(stream: BinaryIO, episodes: Episodes) -> None:
 
 
 def read_npz(file: Path) -> Episodes:
-    """Return the episodes of a file that `write_npz` wrote.
-
-    Raises
-    ------
-    LogError
-        The file is cut or damaged, or koopmpc did not write it.
-    """
+    """Return the episodes of a file that `write_npz` wrote."""
     try:
         with disk.Members(file) as members:
             members.require("X", "U", "steps", "about")

@@ -30,13 +30,7 @@ _TABLE_ADVICE = "pass a file that Episodes.save wrote, or a table as .parquet"
 
 
 def write_parquet(stream: BinaryIO, episodes: Episodes) -> None:
-    """Write the stacked rows; the inputs of an episode's last row are null, for none was applied there.
-
-    Raises
-    ------
-    DataError
-        A state or an input has the name of a column that the file adds.
-    """
+    """Write the stacked rows; the inputs of an episode's last row are null, for none was applied there."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -66,13 +60,7 @@ def _checksum(about: str, episode: np.ndarray, step: np.ndarray, X: np.ndarray, 
 
 
 def read_parquet(file: Path) -> Episodes | LogTable:
-    """Return the episodes of a file that `write_parquet` wrote, or the columns of another program's table.
-
-    Raises
-    ------
-    LogError
-        The file is damaged, or its rows were changed.
-    """
+    """Return the episodes of a file that `write_parquet` wrote, or the columns of another program's table."""
     schema = _schema(file)
     if not {_KEY, _CHECK} & (schema.metadata or {}).keys():
         table = _table(file, [name for name in schema.names if schema.names.count(name) == 1])
@@ -95,19 +83,7 @@ def read_parquet(file: Path) -> Episodes | LogTable:
 
 
 def _read_rows(file: Path, stretches: list[tuple[int, int]], plant: PlantSignature | None, place: str) -> Episodes:
-    """Return stretches of the episodes of a file as episodes of their own; only the groups with their rows are read.
-
-    Parameters
-    ----------
-    file
-        A file that `Episodes.save` wrote.
-    stretches
-        (first row, steps) of each.
-    plant
-        The sample time and names that the file must have; None for the first file, which defines them.
-    place
-        The file and its rows, for messages.
-    """
+    """Return stretches of the episodes of a file as episodes of their own; only the groups with their rows are read."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -22,11 +22,6 @@ def write_plain(stream: BinaryIO, episodes: Episodes) -> None:
 
     Numbers read back to the bit. The inputs of an episode's last row are empty: none was applied there, and by this the
     reader knows them.
-
-    Raises
-    ------
-    DataError
-        The table would read back with other names or roles.
     """
     driven = episodes.driven()
     head = ",".join(_quote(name) for name in (*SAVED, *driven.states, *driven.inputs))
@@ -70,11 +65,6 @@ def read_plain(file: Path) -> LogTable:
 
     Comma, semicolon, tab or spaces are found from the first line; with semicolons a decimal comma is understood. Lines
     above it that begin with # or % are skipped. A file that begins with numbers has columns 1, 2, ….
-
-    Raises
-    ------
-    LogError
-        The file is empty, a row has another number of cells, or a name is a number.
     """
     return _parse(file.read_bytes(), file)
 

@@ -13,13 +13,12 @@ from jaxtyping import Bool, Float
 from koopmpc.base.errors import DataError, FitWarning
 from koopmpc.data.episodes import Episodes, PlantSignature
 from koopmpc.data.files.columns import ColumnRoles, TableSettings, find_roles
-from koopmpc.data.files.formats import LogTable, Recording, Samples
+from koopmpc.data.files.formats import Channel, LogTable, Recording, Samples
+from koopmpc.data.files.sampling import GAP
 from koopmpc.data.files.tables import read_table
 from koopmpc.data.source import Part
 
 TIME = "time [s]"  # name of the common clock in the table of a recording
-GUESSED = 20  # with more channels than this their roles are not guessed from the names
-GAP = 1.5  # a channel is silent where its samples are farther apart than this many sample times
 _PACE = 1000  # first samples of a channel that tell its sample time
 PART = 2_000_000  # samples of one part of a large recording, about
 LARGE = 8_000_000  # samples of all chosen channels from which a recording is read in parts
@@ -46,11 +45,6 @@ def read_recording(file: Path, recording: Recording, settings: TableSettings) ->
     slowest state, or of ``resample=``: states are interpolated linearly, inputs and disturbances hold their value. A
     state has no value, and an episode ends, where its samples are farther apart than 1.5 dt and 1.5 of its own usual
     steps. A warning says which channels were resampled.
-
-    Raises
-    ------
-    DataError
-        A channel is missing, the roles of many channels cannot be guessed, or no two rows hold all of them.
     """
     layout = _find_layout(file, recording, settings)
     if layout.resampled:
@@ -109,29 +103,35 @@ def _load_part(
 
 
 def _find_layout(file: Path, recording: Recording, settings: TableSettings) -> _Layout:
-    channels = recording.channels()
+    roles, own = _find_channels(file, recording.channels(), settings)
+    silent = next((title for title, channel in own.items() if channel.count < 2), None)
+    if silent is not None:
+        raise DataError(f"{file}: {silent!r} has less than two samples; leave it out, or pass states= and inputs=")
+    chosen = tuple(channel.name for channel in own.values())
+    heads = [time for time, _ in recording.read(chosen, count=_PACE)]
+    paces = tuple(_find_pace(time, title, file) for time, title in zip(heads, own, strict=True))
+    shared = all(np.array_equal(time, heads[0]) for time in heads) and len({one.count for one in own.values()}) == 1
+    dt = settings.resample or settings.dt or max(paces[: len(roles.states)])
+    first = max(float(time[0]) for time in heads)
+    return _Layout(roles, chosen, dt, first, paces, resampled=not shared or settings.resample is not None)
+
+
+def _find_channels(
+    file: Path, channels: Sequence[Channel], settings: TableSettings, most: int = 20
+) -> tuple[ColumnRoles, dict[str, Channel]]:
+    """Return the roles, and the channel of each of their names; with more than `most` channels none is guessed."""
     if not channels:
         raise DataError(f"{file} has no channel of numbers")
     titles = settings.rename([channel.title for channel in channels], str(file))
     told = settings.match_names(titles)
-    if (told.states is None or told.inputs is None) and len(titles) > GUESSED:
+    if None in (told.states, told.inputs) and len(titles) > most:
         raise DataError(
             f"{file} has {len(titles)} channels, too many to guess their roles: pass states= and inputs=; they are "
             f"{', '.join(titles)}"
         )
-    names = dict(zip(titles, [channel.name for channel in channels], strict=True))
     roles = find_roles(titles, titles, told, str(file))
-    chosen = tuple(names[title] for title in roles.values)
-    counts = {channel.name: channel.count for channel in channels}
-    silent = next((title for title in roles.values if counts[names[title]] < 2), None)
-    if silent is not None:
-        raise DataError(f"{file}: {silent!r} has less than two samples; leave it out, or pass states= and inputs=")
-    heads = recording.read(chosen, count=_PACE)
-    paces = tuple(_find_pace(time, title, file) for (time, _), title in zip(heads, roles.values, strict=True))
-    shared = all(np.array_equal(time, heads[0][0]) for time, _ in heads) and len({counts[n] for n in chosen}) == 1
-    dt = settings.resample or settings.dt or max(paces[: len(roles.states)])
-    first = max(float(time[0]) for time, _ in heads)
-    return _Layout(roles, chosen, dt, first, paces, resampled=not shared or settings.resample is not None)
+    named = dict(zip(titles, channels, strict=True))
+    return roles, {title: named[title] for title in roles.values}
 
 
 def _settle(layout: _Layout, settings: TableSettings) -> TableSettings:

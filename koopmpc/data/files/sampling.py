@@ -12,12 +12,8 @@ from koopmpc.data.episodes import Episode, Origin, find_lines
 from koopmpc.data.files.columns import ColumnRoles
 from koopmpc.data.files.notes import ResampledWarning
 
-_YEAR_2000 = 946_684_800.0  # [s] since 1970
-_YEAR_2100 = 4_102_444_800.0  # [s] since 1970
-_JITTER = 0.02  # share of dt by which a step may differ
-_GAP = 1.5  # a step longer than 1.5 dt is a gap
-_FEW = 10  # rows from which on single wild readings are looked for
-_WILD = 8.0  # they are so many times the usual distance from the line between their neighbours
+JITTER = 0.02  # a step of time may differ by this share from the sample time; beyond, sampling is unequal
+GAP = 1.5  # a step of more than this many sample times is a gap, where an episode ends
 
 
 class UnevenSamplingError(DataError):
@@ -49,16 +45,21 @@ class Signals:
         return Signals(time, self.X[which], self.U[which], self.W[which], self.rows[which], self.states)
 
 
-def read_clock(column: Float[np.ndarray, " M"], roles: ColumnRoles, where: str) -> Float[np.ndarray, " M"]:
+def read_clock(
+    column: Float[np.ndarray, " M"],
+    roles: ColumnRoles,
+    where: str,
+    years: tuple[float, float] = (946_684_800.0, 4_102_444_800.0),
+) -> Float[np.ndarray, " M"]:
     """Return a column of time in seconds.
 
-    Seconds whose size says that they are milli-, micro- or nanoseconds since 1970 (years 2000 to 2100) are read in that
-    unit, and a warning says so.
+    Seconds whose size says that they are milli-, micro- or nanoseconds since 1970 are read in that unit, and a warning
+    says so; `years` are the first and the last second of such logs since 1970 [s], 2000 to 2100.
     """
     known = np.abs(column[np.isfinite(column)])
     if roles.scale == 1.0 and len(known):
         for unit, per_second in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
-            if _YEAR_2000 * per_second <= known.min() and known.max() < _YEAR_2100 * per_second:
+            if years[0] * per_second <= known.min() and known.max() < years[1] * per_second:
                 warnings.warn(
                     f"{where}: {roles.time!r} is read in {unit} since 1970, which its size says; to say it, name the "
                     f"column 'time [{unit}]'",
@@ -70,13 +71,7 @@ def read_clock(column: Float[np.ndarray, " M"], roles: ColumnRoles, where: str) 
 
 
 def sample_time(times: list[np.ndarray], where: str) -> float:
-    """Return the median step of a time column, given part by part, to six digits.
-
-    Raises
-    ------
-    DataError
-        There are less than two rows, or time stands still.
-    """
+    """Return the median step of a time column, given part by part, to six digits."""
     steps = np.concatenate([np.zeros(0), *map(np.diff, times)])
     steps = steps[np.isfinite(steps) & (steps > 0)]
     if not len(steps):
@@ -119,7 +114,7 @@ def resample(parts: list[Signals], dt: float, where: str) -> list[Signals]:
         whole = part.at(np.isfinite(part.X).all(axis=1) & np.isfinite(part.time))
         assert whole.time is not None
         ahead = np.diff(whole.time)
-        longest = _GAP * max(dt, float(np.median(ahead))) if len(ahead) else dt
+        longest = GAP * max(dt, float(np.median(ahead))) if len(ahead) else dt
         at = _edges(ahead > longest)
         pieces = [_advancing(whole.at(slice(a, b))) for a, b in pairwise(at) if b - a > 1]
         gaps += [int(whole.rows[k - 1]) for k in at[1:-1]]
@@ -152,10 +147,10 @@ def _warn_of_uneven(parts: list[Signals], dt: float, where: str) -> None:
     if not len(known):
         return
     usual, uneven, first = float(f"{np.median(known):.6g}"), 0, ("", 0.0)
-    if not usual / _GAP <= dt <= _GAP * usual:
+    if not usual / GAP <= dt <= GAP * usual:
         return
     for part, ahead in zip(whole, steps, strict=True):
-        off = np.flatnonzero((ahead > 0) & (ahead <= _GAP * usual) & (np.abs(ahead - usual) > _JITTER * usual))
+        off = np.flatnonzero((ahead > 0) & (ahead <= GAP * usual) & (np.abs(ahead - usual) > JITTER * usual))
         if len(off) and not uneven:
             k = int(off[0])
             unit, (line,) = find_lines(where, [int(part.rows[k + 1])])
@@ -201,17 +196,22 @@ def _on_grid(part: Signals, dt: float, where: str) -> Signals:
     return Signals(grid, states, part.U[held], part.W[held], part.rows[held], part.states, origin)
 
 
-def _single_readings(t: Float[np.ndarray, " m"], x: Float[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
-    """Return which readings are far from the line between their neighbours, which would leak into rows of a grid."""
+def _single_readings(
+    t: Float[np.ndarray, " m"], x: Float[np.ndarray, " m"], few: int = 10, far: float = 8.0
+) -> Bool[np.ndarray, " m"]:
+    """Return which readings would leak into rows of a grid; of fewer than `few` rows none.
+
+    They are `far` times the usual distance from the line between their neighbours, half of the range, and alone there.
+    """
     wild = np.zeros(len(x), dtype=bool)
-    if len(x) < _FEW:
+    if len(x) < few:
         return wild
     line = x[:-2] + (x[2:] - x[:-2]) * (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
     off = np.abs(x[1:-1] - line)
     low, high = np.quantile(x, [0.05, 0.95])
-    far = (off > 0.5 * (high - low)) & (off > _WILD * np.median(off)) & (high > low)
+    wide = (off > 0.5 * (high - low)) & (off > far * np.median(off)) & (high > low)
     beside = np.maximum(np.append(off[1:], 0.0), np.insert(off[:-1], 0, 0.0))
-    wild[1:-1] = far & (off > 1.5 * beside)
+    wild[1:-1] = wide & (off > 1.5 * beside)
     return wild
 
 
@@ -219,11 +219,6 @@ def episodes_from(parts: list[Signals], dt: float, where: str) -> list[Episode]:
     """Return the episodes between gaps; a warning counts the gaps and the lost rows.
 
     A gap is a missing value, a step of time of more than 1.5 dt, or a row without a neighbour.
-
-    Raises
-    ------
-    DataError
-        Sampling is unequal, or nothing is left.
     """
     found: list[Episode] = []
     rows = kept = 0
@@ -257,8 +252,8 @@ def _runs(part: Signals, dt: float, where: str, gaps: list[int]) -> list[tuple[i
     joined = known[:-1] & known[1:] & driven[:-1]  # row k leads to row k + 1
     if part.time is not None:
         steps = np.diff(part.time)
-        joined = joined & np.isfinite(steps) & (steps <= _GAP * dt)
-        uneven = np.flatnonzero(joined & (np.abs(steps - dt) > _JITTER * dt))
+        joined = joined & np.isfinite(steps) & (steps <= GAP * dt)
+        uneven = np.flatnonzero(joined & (np.abs(steps - dt) > JITTER * dt))
         if len(uneven):
             k = int(uneven[0])
             raise UnevenSamplingError(

@@ -63,23 +63,7 @@ class _Assigned:
 
 
 def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
-    """Return the episodes of a plain table; `load_episodes` says what its columns mean.
-
-    Parameters
-    ----------
-    file
-        The table's file, for messages.
-    table
-        Its columns.
-    told
-        The caller's knowledge, which need not be inferred.
-
-    Raises
-    ------
-    DataError
-        A role or the sample time is neither given nor inferable, a column is missing or holds a cell that is no
-        number, or the rows are no whole episodes.
-    """
+    """Return the episodes of a plain table; `load_episodes` says what its columns mean."""
     where = str(file)
     table = _rename_columns(table.with_units(), told, where)
     told = told.match_names(table.names)
@@ -200,15 +184,7 @@ def _say_set_points(names: Sequence[str]) -> str:
 
 
 def _rename_columns(table: LogTable, told: TableSettings, where: str) -> LogTable:
-    """Return the table with the names that the caller gives to all columns.
-
-    Raises
-    ------
-    DataError
-        There are more or fewer names than columns, or a column to rename is not there.
-    LogError
-        The table has no line of names, and the caller gives neither names nor numbers of columns.
-    """
+    """Return the table with the names that the caller gives to all columns."""
     count = len(table.names)
     if told.columns is None:
         if not table.named and not told.roles:
@@ -237,21 +213,7 @@ def _find_clock(names: Sequence[str], columns: Mapping[str, np.ndarray], told: T
 
 
 def _numbers(column: np.ndarray, name: str, where: str) -> np.ndarray:
-    """Return a column of objects as floats, None as NaN; return a column of text unchanged.
-
-    Parameters
-    ----------
-    column
-        (rows,) of any kind.
-    name, where
-        The column and its file, for messages.
-
-    Raises
-    ------
-    DataError
-        At least half of the cells look like numbers, but one is no real number: a decimal comma, a complex number or
-        a word. The whole column would be lost for that cell.
-    """
+    """Return a column of objects as floats, None as NaN; return a column of text unchanged."""
     if column.dtype.kind != "O":
         return column
     present = [cell for cell in column if cell is not None]

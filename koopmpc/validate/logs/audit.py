@@ -13,6 +13,8 @@ from koopmpc.base.terminal import label_lines, render_text
 from koopmpc.base.text import to_percent
 from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
+from koopmpc.data.files.sampling import GAP, JITTER
+from koopmpc.lifting.base import strip_unit
 from koopmpc.validate.closed_loop import find_feedback
 from koopmpc.validate.drift import DriftReport, find_drift
 from koopmpc.validate.logs import values
@@ -23,22 +25,58 @@ from koopmpc.validate.logs.alignment import (
     find_saturated_actuators,
 )
 from koopmpc.validate.logs.changes import find_changes
-from koopmpc.validate.logs.inputs import find_constant_inputs, find_low_excitation
 from koopmpc.validate.logs.log import (
+    CHECKS,
+    Check,
     Log,
     LogFault,
     Place,
     Repair,
     find_stretches,
-    list_checks,
     list_places,
     register_check,
 )
 from koopmpc.validate.logs.timing import InputTiming, Timing, find_same_row_inputs, measure_timing
 from koopmpc.validate.memory import Memory, find_hidden_state
+from koopmpc.validate.sufficiency import persistency
+
+
+def find_constant_inputs(log: Log) -> Iterator[LogFault]:
+    """Find inputs that never move."""
+    for j in np.flatnonzero(np.ptp(log.U, axis=0) == 0):
+        name = strip_unit(log.data.inputs[j])
+        yield LogFault(
+            "constant input",
+            f"{name} is {log.U[0, j]:.4g} throughout: its effect cannot be learned",
+            f"excite {name}, with km.Noise or km.data.PRBS, or leave it out",
+            (log.data.inputs[j],),
+            repair=Repair.COLUMN,
+        )
+
+
+def find_low_excitation(log: Log) -> Iterator[LogFault]:
+    """Find inputs that are exciting of a lower order than the plant has states."""
+    order = log.data.nx + 1
+    for j in np.flatnonzero(np.ptp(log.U, axis=0) > 0):
+        long = [e for e in log.data if len(e) > order + 1]
+        if not long:
+            continue
+        # use differences: a constant level would raise the order by one without exciting the plant
+        differences = Episodes([Episode(X=e.X[1:], U=np.diff(e.U[:, [j]], axis=0)) for e in long], log.data.dt)
+        good = int((persistency(differences, order).conditions < 1e7).sum())
+        if good < min(order, 3):
+            name = strip_unit(log.data.inputs[j])
+            yield LogFault(
+                "little excitation",
+                f"{name} excites to order {good} only, and {log.data.nx} states ask for {order}: a sine, or rare steps",
+                f"excite {name} with km.Noise, km.data.PRBS or km.data.Multisine",
+                (log.data.inputs[j],),
+            )
+
 
 DELAYS = "Fit with delays (embedding=km.Delay(2)) or with a hidden state (km.identify.subspace), or measure that state"
-for _check in (
+_DEPENDENT = "inputs together"  # after it nothing can be said of a single input
+for _find in (
     values.find_repeated_columns,
     values.find_repeated_episodes,
     values.find_coarse_sensors,
@@ -49,11 +87,15 @@ for _check in (
     values.find_held_samples,
     values.find_outliers,
 ):
-    register_check(_check)
-for _check in (find_constant_inputs, find_dependent_inputs, find_low_excitation, find_feedback):
-    register_check(_check, of_inputs=True)
+    register_check(_find)
+for _find in (find_constant_inputs, find_dependent_inputs, find_low_excitation, find_feedback):
+    register_check(_find, of_inputs=True)
+register_check(find_inputs_without_effect, of_rest=True, unless=["feedback", _DEPENDENT])
+register_check(find_changes, of_rest=True)
+register_check(values.find_jumps, of_rest=True)
+for _find, _too in ((find_late_signals, ()), (find_saturated_actuators, ("input delay", "late sensor"))):
+    register_check(_find, of_rest=True, unless=["quantised", "slow sensor", _DEPENDENT, *_too])
 _HIDDEN = "rows at the sensor's limit are missing, and it is the output that chose them"
-_MOST_STEPS = 200_000  # check at most this many steps, those of the first episodes
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +152,7 @@ class AuditReport(Value):
         DataError
             Every row is faulty.
         """
-        rest = Remainder.of(data).without([place for fault in self.faults for place in fault.places])
+        rest = Remainder.of(data).without_faults(self.faults)
         if rest is None:
             raise DataError("every row of the data is at fault; see the report for what to do")
         return rest.data
@@ -163,27 +205,17 @@ def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None, against: 
     DataError
         The data are not Episodes, or the times do not match them.
     """
-    data = _take_first(episodes_of(data))
+    data = _take_first(episodes_of(data), 200_000)
     if times is not None:
         checks.kind(times, "times", (tuple, list), "pass one array of times an episode")
     faults = [] if times is None else list(find_clock_faults(data, times))
     log = Log(data)
-    for check in (*list_checks(of_inputs=False), *(list_checks(of_inputs=True) if data.nu else ())):
-        faults += check(log)
-    kinds = {fault.name for fault in faults}
     whole = Remainder.of(_unwrap_angles(data, values.find_whole_turns(log)))
-    rest = whole.without([p for fault in faults for p in fault.places])
-    for check in (find_inputs_without_effect, find_changes, values.find_jumps):
-        if rest is None or (check is find_inputs_without_effect and kinds & {"feedback", "inputs together"}):
-            continue
-        new_faults = [rest.locate_fault(fault) for fault in check(Log(rest.data))]
-        faults += new_faults
-        rest = whole.without([p for fault in faults for p in fault.places]) if new_faults else rest
-    rough = bool(values.find_coarse_states(log) or values.find_slow_states(log))
-    if rest is not None and not rough and "inputs together" not in kinds:
-        late_signals = list(find_late_signals(Log(rest.data)))
-        faults += late_signals or list(find_saturated_actuators(Log(rest.data)))
-    timing = measure_timing(Log(rest.data)) if rest is not None and "inputs together" not in kinds else ()
+    for check in CHECKS.values():
+        if data.nu or not check.of_inputs:
+            faults += _run_check(check, log, whole, faults)
+    kinds, rest = {fault.name for fault in faults}, whole.without_faults(faults)
+    timing = measure_timing(Log(rest.data)) if rest is not None and _DEPENDENT not in kinds else ()
     if "sensor at its limit" in kinds:  # rows that y chose are gone: y seems to predict any input
         timing = tuple(replace(one, why=_HIDDEN, feedback=False) if one.feedback else one for one in timing)
     faults += find_same_row_inputs(timing)
@@ -192,10 +224,20 @@ def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None, against: 
     return AuditReport(tuple(faults), len(data), sum(map(len, data)), timing, memory, drift)
 
 
-def _take_first(data: Episodes) -> Episodes:
-    """Return the first episodes, with at most the number of steps that the audit checks."""
+def _run_check(check: Check, log: Log, whole: "Remainder", faults: Sequence[LogFault]) -> list[LogFault]:
+    """Return what a check finds after these faults."""
+    if check.unless.intersection(fault.name for fault in faults):
+        return []
+    if not check.of_rest:
+        return list(check.find(log))
+    rest = whole.without_faults(faults)
+    return [] if rest is None else [rest.locate_fault(fault) for fault in check.find(Log(rest.data))]
+
+
+def _take_first(data: Episodes, most: int) -> Episodes:
+    """Return the first episodes, with at most so many steps."""
     ends = np.cumsum([len(episode) for episode in data])
-    return data[: max(int(np.searchsorted(ends, _MOST_STEPS, side="right")), 1)]
+    return data[: max(int(np.searchsorted(ends, most, side="right")), 1)]
 
 
 def _unwrap_angles(data: Episodes, whole_turns: dict[int, float]) -> Episodes:
@@ -242,6 +284,10 @@ class Remainder:
                 origins.append(Place(e, a, b + 1))
         return Remainder(self.data.with_episodes(pieces), tuple(origins)) if pieces else None
 
+    def without_faults(self, faults: Sequence[LogFault]) -> "Remainder | None":
+        """Return the pieces that remain without the rows of these faults."""
+        return self.without([place for fault in faults for place in fault.places])
+
     def locate_fault(self, fault: LogFault) -> LogFault:
         """Return the fault with its places in the original data."""
         places: list[Place] = []
@@ -252,19 +298,8 @@ class Remainder:
         return replace(fault, says=says, places=tuple(places))
 
 
-_JITTER = 0.02  # a step may differ from dt by this share, as in load_episodes
-_GAP = 1.5  # a step longer than this many dt is a gap
-_OTHER_RATE = 0.1  # an episode has another rate if its median step differs from dt by more than this share
-
-
-def find_clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[LogFault]:
-    """Find faults in the time stamps of the rows.
-
-    Raises
-    ------
-    DataError
-        The number of time stamps differs from the number of rows.
-    """
+def find_clock_faults(data: Episodes, times: Sequence[ArrayLike], other_rate: float = 0.1) -> Iterator[LogFault]:
+    """Find faults in the time stamps of the rows; an episode has another rate if its median step is so far from dt."""
     if len(times) != len(data):
         raise DataError(f"times are given for {len(times)} episodes, the data have {len(data)}; pass one array each")
     steps = [
@@ -285,8 +320,8 @@ def find_clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[Lo
             places=resets,
             repair=Repair.LEAVE_OUT,
         )
-    gaps = _find_steps(steps, lambda d: d > _GAP * dt)
-    other = [e for e, d in enumerate(steps) if abs(np.median(d) - dt) > _OTHER_RATE * dt]
+    gaps = _find_steps(steps, lambda d: d > GAP * dt)
+    other = [e for e, d in enumerate(steps) if abs(np.median(d) - dt) > other_rate * dt]
     if other:
         shown = ", ".join(f"episode {e} {np.median(steps[e]):.4g} s" for e in other[:3])
         yield LogFault(
@@ -307,8 +342,8 @@ def find_clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[Lo
         )
     usual = [d for e, d in enumerate(steps) if e not in other]
     usual = np.concatenate(usual) if usual else np.zeros(0)
-    usual = usual[(usual > 0) & (usual <= _GAP * dt)]
-    uneven = np.abs(usual - dt) > _JITTER * dt
+    usual = usual[(usual > 0) & (usual <= GAP * dt)]
+    uneven = np.abs(usual - dt) > JITTER * dt
     if uneven.any():
         yield LogFault(
             "jitter",

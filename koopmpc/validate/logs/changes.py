@@ -114,22 +114,15 @@ def find_changes(log: Log) -> Iterator[LogFault]:
     apart = sorted(sorted(apart, key=lambda s: -errors[s].max())[:12])
     best: tuple[float, Change, list[int]] | None = None
     for change in _list_changes(log, law, [segments[s] for s in apart]):
-        total, explained = 0.0, list[int]()
-        for s in apart:
-            undone = change.errors(law, *segments[s])
-            gain = float((np.clip(errors[s], spread, None) - np.clip(undone, spread, None)).mean())
-            follows = undone.max() < spread + _LIMITS.back + change.allowance and gain > _LIMITS.gain_share * most[s]
-            least = _LIMITS.offset_gain if change.kind == "offset change" else _LIMITS.gain
-            if gain > least and follows and gain * len(segments[s][1]) > _LIMITS.sure:
-                total += gain * len(segments[s][1])
-                explained.append(s)
-        if len(explained) == 1 and change.tuned:
+        gains = {s: _measure_gain(change, law, segments[s], errors[s], spread, most[s]) for s in apart}
+        explained = [s for s, gain in gains.items() if gain > 0]
+        if not explained or (len(explained) == 1 and change.tuned):
             continue
-        if explained and len(log.data) == 1:
-            between = agreeing.intersection(range(explained[0], explained[-1]))
-            if len(between) > 0.2 * len(explained):
-                continue  # within one episode a recorder changes once, and does not change back
-        if explained and (best is None or total > 1.02 * best[0]):
+        between = agreeing.intersection(range(explained[0], explained[-1]))
+        if len(log.data) == 1 and len(between) > 0.2 * len(explained):
+            continue  # within one episode a recorder changes once, and does not change back
+        total = sum(gains[s] for s in explained)
+        if best is None or total > 1.02 * best[0]:
             best = (total, change, explained)
     if best is None:
         return
@@ -144,6 +137,18 @@ def find_changes(log: Log) -> Iterator[LogFault]:
         places,
         repair=Repair.LEAVE_OUT if change.kind == "mixed sampling" else Repair.TRY_WITHOUT,
     )
+
+
+def _measure_gain(
+    change: Change, law: OneStepLaw, segment: Segment, errors: np.ndarray, spread: float, most: float
+) -> float:
+    """Return the nats that a segment gains if a change is undone; 0 where it does not follow the law then."""
+    undone = change.errors(law, *segment)
+    gain = float((np.clip(errors, spread, None) - np.clip(undone, spread, None)).mean())
+    follows = undone.max() < spread + _LIMITS.back + change.allowance and gain > _LIMITS.gain_share * most
+    least = _LIMITS.offset_gain if change.kind == "offset change" else _LIMITS.gain
+    total = gain * len(segment[1])
+    return total if gain > least and follows and total > _LIMITS.sure else 0.0
 
 
 def _cut_segments(log: Log) -> list[Place]:

@@ -1,6 +1,6 @@
 """The data that every check of the audit reads: columns, places of faults, and one-step regressions."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache, cached_property
@@ -76,19 +76,38 @@ class LogFault(Value):
     repair: Repair = Repair.TRY_WITHOUT
 
 
-Check = Callable[["Log"], Iterator[LogFault]]
-_CHECKS: dict[Check, bool] = {}  # in the order of registration; whether it is of logs with inputs alone
+Find = Callable[["Log"], Iterator[LogFault]]
 
 
-def register_check(check: Check, *, of_inputs: bool = False) -> Check:
-    """Have `audit` look for this fault too; `of_inputs` says that it is looked for in logs with inputs alone."""
-    _CHECKS[check] = of_inputs
-    return check
+@dataclass(frozen=True)
+class Check:
+    """A check of logs that is registered.
+
+    Attributes
+    ----------
+    find
+        Log → its faults.
+    of_inputs
+        It looks at logs with inputs alone.
+    of_rest
+        It looks at the rows that no check before it reports, with angles unwrapped.
+    unless
+        Kinds of faults after which it tells nothing.
+    """
+
+    find: Find
+    of_inputs: bool = False
+    of_rest: bool = False
+    unless: frozenset[str] = frozenset()
 
 
-def list_checks(*, of_inputs: bool) -> list[Check]:
-    """Return the checks that need inputs, or those that do not."""
-    return [check for check, needs in _CHECKS.items() if needs is of_inputs]
+CHECKS: dict[Find, Check] = {}  # in the order of registration, which is that of the audit
+
+
+def register_check(find: Find, *, of_inputs: bool = False, of_rest: bool = False, unless: Collection[str] = ()) -> Find:
+    """Have `audit` look for this fault too, after those that are registered; `Check` says what the keywords mean."""
+    CHECKS[find] = Check(find, of_inputs, of_rest, frozenset(unless))
+    return find
 
 
 @dataclass(frozen=True, eq=False)

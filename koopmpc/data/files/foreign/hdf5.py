@@ -23,11 +23,6 @@ def read_hdf5(file: Path) -> LogTable:
     """Return the datasets of numbers by their path, ``group.name``; those of one row a sample are the columns.
 
     A dataset of a compound type gives a column for each of its fields. Attributes ``units`` or ``unit`` are units.
-
-    Raises
-    ------
-    LogError
-        It is no HDF5 file, or it is damaged.
     """
     arrays, units = load_datasets(file)
     return tabulate_arrays(file, arrays, units)
@@ -85,11 +80,6 @@ def tabulate_arrays(file: Path, arrays: Mapping[str, np.ndarray], units: Mapping
     A name is the last part of its path where no other column has the same. The number of samples is the length that
     most columns share; of two, the longer. A matrix may lie on its side. A scalar named ``dt``, ``Ts`` or
     ``sample_time`` [s], or ``fs`` [Hz], tells the sample time.
-
-    Raises
-    ------
-    DataError
-        No array has two rows or more.
     """
     numbers = {name: array for name, array in arrays.items() if array.dtype.kind in "fiub" and array.size}
     long = {name: array for name, array in numbers.items() if max(array.shape, default=1) > 1}

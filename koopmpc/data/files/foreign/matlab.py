@@ -15,15 +15,7 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"  # begins an HDF5 file; MATLAB 7.3 writes it after 
 
 
 def read_matlab(file: Path) -> LogTable:
-    """Return the numeric variables; a field of a struct is ``struct.field``.
-
-    Raises
-    ------
-    LogError
-        It is no .mat file, or it is damaged.
-    DataError
-        It holds objects of MATLAB classes alone, as ``iddata``, ``timetable`` or ``timeseries``.
-    """
+    """Return the numeric variables; a field of a struct is ``struct.field``."""
     from scipy.io import loadmat
 
     with file.open("rb") as stream:

@@ -136,13 +136,7 @@ def _complete_unfinished(error: BaseException) -> None:
 
 
 def _read_formulas(mdf: Any, file: Path) -> dict[tuple[int, int], Callable[[np.ndarray], np.ndarray]]:
-    """Return the formulas of channels by (group, channel).
-
-    Raises
-    ------
-    LogError
-        A formula holds more than arithmetic, computes the time of a group, or stands inside another conversion.
-    """
+    """Return the formulas of channels by (group, channel)."""
     formulas: dict[tuple[int, int], Callable[[np.ndarray], np.ndarray]] = {}
     for g, group in enumerate(mdf.groups):
         for c, channel in enumerate(group.channels):
@@ -183,11 +177,6 @@ def read_formula(text: str, channel: str) -> Callable[[Values], Values]:
 
     A formula has numbers, ``X`` or ``X1``, + − * / and the power ^ or ``**``, parentheses, and functions such as
     ``sqrt``, ``exp``, ``log`` and ``sin``.
-
-    Raises
-    ------
-    LogError
-        The formula holds anything else; it is not computed.
     """
     try:
         if len(text) > _LONGEST:

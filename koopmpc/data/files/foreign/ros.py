@@ -5,7 +5,7 @@ import json
 import sqlite3
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -27,6 +27,16 @@ Message = tuple[str, int, Any]  # topic, time [ns], what it holds
 Decoder = Callable[[bytes], Any]
 
 
+@contextmanager
+def _explain_damage(file: Path) -> Iterator[None]:
+    try:
+        yield
+    except (KoopmpcError, ModuleNotFoundError):
+        raise
+    except Exception as error:  # mcap, rosbags and sqlite3 raise errors of their own, and struct.error, KeyError, …
+        raise LogError(f"{file} cannot be read as messages: {error}; take another copy") from error
+
+
 class MessageRecording(Recording):
     """Channels of messages: the numbers in them, by topic and field.
 
@@ -37,21 +47,16 @@ class MessageRecording(Recording):
     def __init__(self, file: Path) -> None:
         self.file = file
         self._channels: tuple[Channel, ...] = ()
-        try:
+        with _explain_damage(file):
             counts, self._span_ns = self._survey()
             found: list[Channel] = []
             self._stamped = bool(counts)
             for topic, count in counts.items():
                 for _, _, content in islice(self._messages([topic], None, None), 1):
-                    numbers = flatten(content)
-                    found += [Channel(f"{topic}{path}", "", count) for path in numbers]
+                    found += [Channel(f"{topic}{path}", "", count) for path in flatten(content)]
                     self._stamped = self._stamped and _read_stamp(content) is not None
             self._channels = tuple(found)
             self._zero = self._find_zero(list(counts))
-        except (KoopmpcError, ModuleNotFoundError):
-            raise
-        except Exception as error:  # mcap, rosbags and sqlite3 raise errors of their own, and struct.error, KeyError, …
-            raise LogError(f"{file} cannot be read as messages: {error}; take another copy") from error
 
     def channels(self) -> tuple[Channel, ...]:
         """Return the channels of numbers."""
@@ -68,27 +73,21 @@ class MessageRecording(Recording):
         first, slack = self._span_ns[0], _LATE if self._stamped else 0.0
         low = None if np.isneginf(begin) else first + int((begin - slack) / _NS)
         high = None if np.isposinf(end) else first + int((end + slack) / _NS) + 1
-        topics = {name: self._find_topic(name) for name in names}
         samples: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in names}
         wanted: dict[str, list[tuple[str, str]]] = {}
-        for name, topic in topics.items():
+        for name in names:
+            topic = self._find_topic(name)
             wanted.setdefault(topic, []).append((name, name[len(topic) :]))
-        try:
-            for topic in wanted if count is not None else [None]:
-                own = list(wanted) if topic is None else [topic]
-                for where, recorded, content in islice(self._messages(own, low, high), count):
-                    stamp = _read_stamp(content) if self._stamped else recorded
+        with _explain_damage(self.file):
+            for topics in [list(wanted)] if count is None else [[topic] for topic in wanted]:
+                for topic, recorded, content in islice(self._messages(topics, low, high), count):
+                    stamp = _read_stamp(content) if self._stamped else None
                     time = ((recorded if stamp is None else stamp) - self._zero) * _NS
-                    if not begin <= time <= end:
-                        continue
-                    numbers = flatten(content)
-                    for name, path in wanted[where]:
-                        samples[name][0].append(time)
-                        samples[name][1].append(numbers.get(path, np.nan))
-        except (KoopmpcError, ModuleNotFoundError):
-            raise
-        except Exception as error:
-            raise LogError(f"{self.file} cannot be read as messages: {error}; take another copy") from error
+                    if begin <= time <= end:
+                        numbers = flatten(content)
+                        for name, path in wanted[topic]:
+                            samples[name][0].append(time)
+                            samples[name][1].append(numbers.get(path, np.nan))
         return [(np.array(times), np.array(values, dtype=np.float64)) for times, values in samples.values()]
 
     def _find_zero(self, topics: Sequence[str]) -> int:
