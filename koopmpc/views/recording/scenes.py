@@ -296,8 +296,9 @@ class Scenes:
         self._u = rows.U[i] if i < len(rows.U) else self._u
         x, y = rows.X[i], rows.Y[i]
         x = y if np.isnan(x).any() and len(y) == len(x) else x
-        shown = self._u is not None and np.isfinite(x).all()
-        return self._names.check(scene(x, self._u), k) if shown else []
+        if self._u is None or not np.isfinite(x).all():
+            return []
+        return self._names.check(scene(x, self._u), k)
 
     def _aim(self, scene: Scene, reference: np.ndarray, u: np.ndarray, step: int) -> list[Shape]:
         """Return the shapes at the state that a reference names; none where it names none."""
