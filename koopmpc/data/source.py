@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
+from operator import getitem
 from typing import cast
 
 from koopmpc.base import checks
@@ -31,15 +32,11 @@ class Part:
     @classmethod
     def in_memory(cls, episodes: Episodes, place: str) -> "Part":
         """Return a part that is in memory."""
-        return cls(place, partial(_same, episodes))
+        return cls(place, partial(getitem, (episodes,), 0))
 
     def map(self, change: EpisodesMap) -> "Part":
         """Return a part whose episodes go through `change` when it is loaded."""
         return Part(self.place, partial(_load_changed, self.load, change))
-
-
-def _same(episodes: Episodes) -> Episodes:
-    return episodes
 
 
 def _load_changed(load: Callable[[], Episodes], change: EpisodesMap) -> Episodes:

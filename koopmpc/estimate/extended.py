@@ -32,8 +32,8 @@ class ExtendedKalman(Value):
 
     It serves the controllers that plan in the state's own coordinates: BilinearMPC and NonlinearMPC. Of a predictor F
     is the re-lifted map. With delays x is ζ, so readings of the past are filtered too; with a hidden state x is
-    [y; z], and z is corrected by what y shows. Each step linearises F and h at the estimate, exactly. d is an additive
-    disturbance of the outputs, one for each, so that a controller leaves no offset.
+    [y; z], and z is corrected by what y shows. Each step linearises F at the estimate exactly, and the h of a StepMap
+    by differences. d is an additive disturbance of the outputs, one for each, so that a controller leaves no offset.
 
     Entries of y that are NaN are left out. A reading at a rail of its sensor with a prediction at it or beyond is left
     out too: it tells nothing more. A reading far from its prediction is refused, for at most six steps in sequence.

@@ -29,10 +29,10 @@ from koopmpc.models.parts import (
     LinearFields,
     build_step_map,
     check_drift,
+    read_state_space,
     refuse_unknown,
     store_fields,
 )
-from koopmpc.models.state_space import read_state_space
 from koopmpc.plants.step_map import StepMap
 
 

@@ -101,10 +101,9 @@ def bilinear_edmd(
     >>> km.BilinearMPC(model, cost, limits, horizon=20)([0.5, 0.0], [0.0, 0.0]).status.name
     'UNCONSTRAINED'
     """
-    source = source_of(episodes)
+    ridge, source = check_ridge(ridge), source_of(episodes)
     if source.nu == 0:
         raise DataError("the episodes have no inputs; pass them to edmd, or give each Episode its U")
-    ridge = check_ridge(ridge)
     if rank is not None and products is not None:
         raise DataError("a rank mixes all observables, so inputs cannot multiply some of them; pass one of the two")
     if scheduled_inputs and (rank is not None or not source.nw):

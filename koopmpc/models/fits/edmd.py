@@ -41,8 +41,10 @@ def fit_regression(
     regression: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls", towards: Towards = "zero"
 ) -> LinearPredictor:
     """Return the model of min Σ ‖ψ(x⁺) − A ψ(x) − B u‖²."""
+    _check_method(rank, method, towards)
     ridge = check_ridge(ridge)
-    _check_method(ridge, rank, method, towards)
+    if method != "ls" and ridge != 0:
+        raise DataError(f'a ridge shrinks A, and method="{method}" undoes what noise shrank; pass one of the two')
     rows, nz = regression.rows, regression.lifting.nz
     if regression.B is not None:  # B is known: subtract B u from the targets, and fit A alone
         known = rows.P[:, nz:] @ regression.B.T
@@ -72,7 +74,7 @@ def fit_regression(
     )
 
 
-def _check_method(ridge: Ridge, rank: Rank, method: Method, towards: Towards) -> None:
+def _check_method(rank: Rank, method: Method, towards: Towards) -> None:
     """Raise DataError where two options do not go together, or one has no such value."""
     if not checks.among(towards, ("zero", "affine")):
         raise DataError(f'towards is {towards!r}; pass "zero" or "affine"')
@@ -80,8 +82,6 @@ def _check_method(ridge: Ridge, rank: Rank, method: Method, towards: Towards) ->
         raise DataError('towards="affine" treats columns differently, and rank mixes them; pass one of the two')
     if not checks.among(method, _WORDS):
         raise DataError(f"method is {method!r}; pass one of {', '.join(map(repr, _WORDS))}")
-    if method != "ls" and ridge != 0:
-        raise DataError(f'a ridge shrinks A, and method="{method}" undoes what noise shrank; pass one of the two')
 
 
 def _fit_reduced(

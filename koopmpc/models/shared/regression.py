@@ -169,6 +169,7 @@ def build_predictor(
 ) -> LinearPredictor:
     """Return z⁺ = A z + B u + E w with [A B E]ᵀ = K, and its report."""
     nz, nu = regression.lifting.nz, len(regression.inputs) - len(regression.disturbances)
+    scale = compute_scale_factor(regression.rows.P[:, :nz], regression.rows.samples)
     return LinearPredictor(
         K[:nz].T,
         K[nz : nz + nu].T,
@@ -182,7 +183,7 @@ def build_predictor(
         E=K[nz + nu :].T,
         disturbances=regression.disturbances,
         embedding=regression.embedding,
-        scale=compute_scale_factor(regression.rows.P[:, :nz], regression.rows.samples),
+        scale=scale,
     )
 
 
@@ -191,6 +192,7 @@ def build_bilinear(
 ) -> BilinearPredictor:
     """Return the bilinear model with the matrices `parts` of K, and its report."""
     nz, nu = regression.lifting.nz, len(regression.inputs) - len(regression.disturbances)
+    scale = compute_scale_factor(regression.rows.P[:, :nz], regression.rows.samples)
     assert regression.C is not None, "an extended regression has its C"
     return BilinearPredictor(
         parts.A,
@@ -207,7 +209,7 @@ def build_bilinear(
         M=parts.M,
         disturbances=regression.disturbances,
         embedding=regression.embedding,
-        scale=compute_scale_factor(regression.rows.P[:, :nz], regression.rows.samples),
+        scale=scale,
     )
 
 
