@@ -105,7 +105,8 @@ def design(
         No input inside the limits holds the reference; the reference or a start lies outside the data; an episode is
         left out.
     """
-    refuse_moved(moved, DesignOptions, "km.DesignOptions", {"tighten": "margin=None", "coverage": "margin=0.95"})
+    if moved:
+        refuse_moved(moved, DesignOptions, "km.DesignOptions", {"tighten": "margin=None", "coverage": "margin=0.95"})
     options = check_options(options, DesignOptions)
     draw, few = checks.generator(options.rng), FEW if options.loops is None else options.loops
     if options.promised is not None:

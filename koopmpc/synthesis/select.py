@@ -123,7 +123,8 @@ def select(
     ----------
     Breiman, Friedman, Olshen & Stone, "Classification and Regression Trees", 1984, section 3.4.3.
     """
-    refuse_moved(moved, SearchOptions, "km.SearchOptions")
+    if moved:
+        refuse_moved(moved, SearchOptions, "km.SearchOptions")
     options = check_options(options, SearchOptions)
     draw = checks.generator(options.rng)
     weights, folds = RIDGES if ridges is None else check_ridges(ridges), checks.count(folds, "folds", 2)

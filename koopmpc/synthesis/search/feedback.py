@@ -85,8 +85,10 @@ def remove_feedback(episodes: Episodes, instruments: Sequence[ArrayLike] | None)
     kept = FeedbackData(episodes, np.zeros(episodes.nx), "")
     share = _measure_share(episodes, instruments is not None)
     if share < SETTINGS.share:
+        if instruments is None or not episodes.nu:
+            return kept
         said = f"{_UNUSED}: the logs hold no feedback, for the states explain {to_percent(share)} of the inputs"
-        return kept if instruments is None or not episodes.nu else replace(kept, sentence=said)
+        return replace(kept, sentence=said)
     sound, replaced = _mend(episodes)
     found: list[tuple[float, FeedbackData]] = []
     reason = ""
