@@ -203,7 +203,7 @@ def _describe_limits(limits: Any, states: Sequence[str], inputs: Sequence[str]) 
         count = len(names) or max(np.size(end) for end in ends)
         free = zip(ends, (-np.inf, np.inf), strict=True)
         low, high = (np.broadcast_to(default if end is None else end, count) for end, default in free)
-        for i in np.flatnonzero(np.isfinite(low) | np.isfinite(high)):
+        for i in np.flatnonzero(np.isfinite(low) | np.isfinite(high)).tolist():
             name = strip_unit(names[i]) if names else f"{letter}{i}"
             parts.append(f"{low[i]:.4g} ≤ {name} ≤ {high[i]:.4g}")
     more = {

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -144,7 +144,11 @@ def refuse_contradictions(cost: Any) -> None:
 
 
 def _check_prices(value: Any, name: str) -> Any:
-    return value if name != "du_slack" and isinstance(value, str) and value == "auto" else check_prices(value, name)
+    return value if name != "du_slack" and checks.among(value, ("auto",)) else check_prices(value, name)
+
+
+def _check_priority(value: Any, name: str) -> Any:
+    return cast("Any", value) if isinstance(value, Mapping) else checks.array(value, name, (None,))
 
 
 def _check_names(value: Any, name: str) -> tuple[str, ...]:
@@ -160,7 +164,7 @@ LIMIT_CHECKS: dict[str, Callable[[Any, str], Any]] = {
     "of": _check_of,
     **dict.fromkeys(("slack", "du_slack", "terminal_slack"), _check_prices),
     "margin": lambda value, name: checks.array(value, name, (None, None)),
-    "priority": lambda value, name: value if isinstance(value, Mapping) else checks.array(value, name, (None,)),
+    "priority": _check_priority,
     "levels": lambda value, name: check_levels(value),
     "dwell": lambda value, name: check_dwell(value),
     "level_steps": checks.count,

@@ -152,10 +152,11 @@ class Cost(Value):
         outputs = self.of.bind(tuple(states)).names if any(name in _OF_OUTPUTS for name in named) else ()
         ordered: dict[str, Any] = {}
         for name in named:
-            names, order = outputs if name in _OF_OUTPUTS else inputs, bounds.order_bound
+            names, by_name = outputs if name in _OF_OUTPUTS else inputs, getattr(self, name)
             if name in ("Q", "R", "R_delta", "output_price"):
-                order = checks.order_by_name
-            ordered[name] = order(getattr(self, name), name, names, None if name == "R" else 0.0)
+                ordered[name] = checks.order_by_name(by_name, name, names, None if name == "R" else 0.0)
+            else:
+                ordered[name] = bounds.order_bound(by_name, name, names, 0.0)
         if callable(self.stage):
             ordered["stage"] = trace_stage(self.stage, len(states), len(inputs))
         return replace(self, **ordered) if ordered else self

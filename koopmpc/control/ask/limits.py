@@ -236,7 +236,8 @@ class Limits(Value):
         """Return which inputs, rates and outputs [x; of(x)] have a row: those with a finite or a declared bound."""
         base = self.base
         inputs, changes = (np.isfinite(box).any(axis=0) for box in (base.inputs(nu), _change_box(base, nu)))
-        return Movable(inputs | _declares(self, "u"), changes | _declares(self, "du"), base.find_rows(nx, ny).kept)
+        inputs, changes = np.logical_or(inputs, _declares(self, "u")), np.logical_or(changes, _declares(self, "du"))
+        return Movable(np.asarray(inputs), np.asarray(changes), base.find_rows(nx, ny).kept)
 
     def tightened(self, band: ArrayLike, most: float = TIGHTEST, *, states: Sequence[str] = ()) -> "Limits":
         """Return the limits with margins: at step k of the horizon by the error band of min(k, 5) steps.
