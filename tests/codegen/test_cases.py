@@ -143,6 +143,16 @@ def test_targets_that_limits_in_time_push_are_pushed_in_c_too():
             step(pair, [0.1, 0.0], size * np.array([np.cos(k), np.sin(k)]))
 
 
+def test_a_fallback_keeps_the_limits_of_its_own_step_alone_where_a_move_is_held_for_several():
+    (A, B), model, x = plants.PAIR, plants.make_pair()[0], np.array([1.5, -1.5])
+    limits = km.Limits(-1, np.random.default_rng(0).uniform(0.1, 1.2, (40, 2)), du_max=0.9)
+    moves = {"a": (1, 1, 4), "b": (2, 4)}
+    pair = both(km.KoopmanMPC(model, km.Cost(Q=[1, 0.5], R=0.05), limits, 6, moves=moves))
+    for k in range(40):
+        u = step(pair, x if k % 3 else [np.nan, 0.0], [0.0, -3.0]).u
+        x = A @ x + B @ u
+
+
 @pytest.mark.parametrize("bent", few([False, True], False))
 def test_in_c_weights_stand_for_priorities(bent):
     (A, B), (model, equations), rng = plants.PAIR, plants.make_pair(), np.random.default_rng(1)

@@ -182,6 +182,7 @@ typedef struct {
 #if KOOPMPC_BOUNDS
   koopmpc_real low[KOOPMPC_NT], high[KOOPMPC_NT]; /**< limits of the plan, of its inputs, of targets */
   koopmpc_real box_low[KOOPMPC_MOVES], box_high[KOOPMPC_MOVES], rate_low[KOOPMPC_NU], rate_high[KOOPMPC_NU];
+  koopmpc_real now_low[KOOPMPC_NU], now_high[KOOPMPC_NU]; /**< limits of the input of this step alone */
   koopmpc_real opened_low[KOOPMPC_MOVES], opened_high[KOOPMPC_MOVES];
   koopmpc_real target_low[(KOOPMPC_N + 1) * KOOPMPC_NL + 1], target_high[(KOOPMPC_N + 1) * KOOPMPC_NL + 1];
   koopmpc_real unpushed; /**< no limit moves a target of rows that are no larger */

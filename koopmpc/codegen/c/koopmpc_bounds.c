@@ -10,6 +10,8 @@ void koopmpc_reset_bounds(koopmpc_state *s) {
     s->box_low[j] = koopmpc_inputs_low[j % KOOPMPC_NU];
     s->box_high[j] = koopmpc_inputs_high[j % KOOPMPC_NU];
   }
+  koopmpc_copy(s->now_low, koopmpc_inputs_low, KOOPMPC_NU);
+  koopmpc_copy(s->now_high, koopmpc_inputs_high, KOOPMPC_NU);
   koopmpc_copy(s->rate_low, koopmpc_rates_low, KOOPMPC_NU);
   koopmpc_copy(s->rate_high, koopmpc_rates_high, KOOPMPC_NU);
   for (int k = 0; k <= KOOPMPC_N; k++) {
@@ -38,6 +40,8 @@ void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
     read_rows(x_low, &b->x_low, LATE, AHEAD, OUT);
     read_rows(x_high, &b->x_high, LATE, AHEAD, OUT);
   }
+  koopmpc_copy(s->now_low, u_low, NU);
+  koopmpc_copy(s->now_high, u_high, NU);
 #if KOOPMPC_HELD_ONCE
   koopmpc_copy(s->box_low, u_low, KOOPMPC_MOVES);
   koopmpc_copy(s->box_high, u_high, KOOPMPC_MOVES);

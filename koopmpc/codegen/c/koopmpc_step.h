@@ -124,8 +124,13 @@ int koopmpc_target_within(koopmpc_state *s, int k, const koopmpc_real *r, const 
 #if KOOPMPC_BOUNDS
 #define KOOPMPC_PLAN_LOW(s) (s)->low
 #define KOOPMPC_PLAN_HIGH(s) (s)->high
+#if KOOPMPC_IS_STAGED
 #define KOOPMPC_BOX_LOW(s) (s)->box_low
 #define KOOPMPC_BOX_HIGH(s) (s)->box_high
+#else
+#define KOOPMPC_BOX_LOW(s) (s)->now_low
+#define KOOPMPC_BOX_HIGH(s) (s)->now_high
+#endif
 #define KOOPMPC_STAGE_BOX_LOW(s, k) ((s)->box_low + (k) * KOOPMPC_NU)
 #define KOOPMPC_STAGE_BOX_HIGH(s, k) ((s)->box_high + (k) * KOOPMPC_NU)
 #define KOOPMPC_TARGET_LOW(s, k) ((s)->target_low + (k) * KOOPMPC_NL)
