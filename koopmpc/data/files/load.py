@@ -119,8 +119,12 @@ def _load_file(file: Any, settings: TableSettings, own: bool) -> Episodes:
     return content
 
 
-register_files(
-    save=save_episodes,
-    read_frame=lambda frame, by, time, told: read_frame(frame, TableSettings(*told), by, time),
-    build_frame=lambda episodes: build_frame(list_columns(episodes)),
-)
+def _read_frame(frame: Any, by: str | None, time: str | None, told: Sequence[Any]) -> Episodes:
+    return read_frame(frame, TableSettings(*told), by, time)
+
+
+def _build_frame(episodes: Episodes) -> Any:
+    return build_frame(list_columns(episodes))
+
+
+register_files(save=save_episodes, read_frame=_read_frame, build_frame=_build_frame)

@@ -270,7 +270,7 @@ def _affordable(parts: list[Signals], dt: float, columns: int, where: str) -> No
         )
 
 
-def _doubt(found: ColumnRoles, table: dict[str, np.ndarray], where: str, *, alone: bool) -> None:
+def _doubt(found: ColumnRoles, table: Mapping[str, np.ndarray], where: str, *, alone: bool) -> None:
     """Warn of roles that may be guessed wrongly, and of columns that are constant or repeat another."""
     if alone:
         stepped = [name for name in found.states if _is_stepped(table[name])]
