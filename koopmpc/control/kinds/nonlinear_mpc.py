@@ -96,7 +96,7 @@ class NonlinearMPC(StagedMPC):
     ) -> None:
         for word in moved:
             known = f"stands with the solver now: pass solver=km.control.NLP({solver!r}, {word}=…)"
-            raise TypeError(f"{word}= {known if word in ('starts', 'settings') else 'is no argument'}")
+            raise TypeError(f"{word}= {known if word in ('starts', 'settings') else 'is not an argument'}")
         self._nlp = solver if isinstance(solver, NLP) else NLP(solver)
         super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
 

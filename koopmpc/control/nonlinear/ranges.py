@@ -30,7 +30,7 @@ def _power(a: Range, b: Range) -> Range:
 
 
 def _is_power_at_zero(a: Range, b: Range) -> bool:
-    """Return whether a base that may be 0 or negative has an exponent that is no whole number from 1 on."""
+    """Return whether a base may be 0 or negative while its exponent is other than 1, 2, …"""
     return not (a[0] > 0 or (b[0] == b[1] and b[0] >= 1 and b[0] % 1 == 0))
 
 
@@ -60,7 +60,7 @@ _RANGES: dict[str, Callable[..., Range]] = {
     "IF_ELSE_ZERO": lambda _, b: (min(0.0, b[0]), max(0.0, b[1])),
     "COPYSIGN": lambda a, _: (-_absolute(a)[1], _absolute(a)[1]),
 }
-# operation → operands for which it may be no number, or have no slope, and how that is told
+# operation → condition on its operands under which it, or its slope, is undefined; and the words for it
 _UNDEFINED: dict[str, tuple[Callable[..., bool], str]] = {
     "SQRT": (lambda a: a[0] <= 0, "a root of what may be 0 or negative"),
     "LOG": (lambda a: a[0] <= 0, "a logarithm of what may be 0 or negative"),

@@ -215,7 +215,7 @@ class LevelRollouts:
             near = np.clip(guess, root.low, root.high)
             costs, sequences = self._run(s, stages, LevelBox(near, near), most)
             if len(costs) == 1:
-                best, most = sequences[0], float(costs[0]) * (1 - 1e-9)  # what is as good up to rounding is no better
+                best, most = sequences[0], float(costs[0]) * (1 - 1e-9)  # a gain of rounding does not count
         costs, sequences = self._run(s, stages, root, most if self._problem.stage is None else np.inf)
         if len(costs) and sequences.shape[1] < len(self._blocks):
             return None

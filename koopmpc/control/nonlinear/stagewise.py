@@ -139,7 +139,7 @@ def list_hard_outputs(softness: Softness, inputs: int) -> Int[np.ndarray, " n"]:
 def sum_costs(
     problem: StagedProblem, X: ca.MX, U: ca.MX, targets: Sequence[ca.MX], diagonals: tuple[ca.MX, ca.MX]
 ) -> ca.MX:
-    """Return what states X (nx, N+1) and inputs U cost at targets R, U_r, M, L, m, but for soft limits.
+    """Return the cost of states X (nx, N+1) and inputs U at targets R, U_r, M, L, m, without that of soft limits.
 
     `diagonals` are those of `weight_symbols`.
     """

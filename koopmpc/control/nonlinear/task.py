@@ -65,7 +65,7 @@ def read_staged_task(
     time_limit: float | None,
     who: str,
 ) -> StagedTask:
-    """Return the task of a controller, checked; `who` is told where weights stand for priorities."""
+    """Return the task of a controller, checked; `who` names it where weights replace priorities."""
     given, ranges = learned_map(model), {} if isinstance(model, StepMap) else data_ranges(model)
     o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges, in_time=True)
     if o.limits.priority is not None:
