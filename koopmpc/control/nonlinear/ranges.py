@@ -30,7 +30,7 @@ def _power(a: Range, b: Range) -> Range:
 
 
 def _is_power_at_zero(a: Range, b: Range) -> bool:
-    """Return whether a base may be 0 or negative while its exponent is other than 1, 2, …"""
+    """Return whether a base may be 0 or negative while its exponent is not a whole number above 0."""
     return not (a[0] > 0 or (b[0] == b[1] and b[0] >= 1 and b[0] % 1 == 0))
 
 
