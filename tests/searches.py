@@ -1,4 +1,4 @@
-"""`km.select` and `km.design` with all their settings as keywords, for tests that vary them in tables."""
+"""`km.select`, `km.design` and `km.certify` with all their settings as keywords, for tests that vary them in tables."""
 
 from typing import Any
 
@@ -14,3 +14,8 @@ def select(data: Any, **asked: Any) -> Any:
 def design(data: Any, cost: km.Cost, limits: km.Limits | None = None, **asked: Any) -> Any:
     """Return `km.design` for the data, cost and limits."""
     return km.design(data, cost, limits, **gather(km.DesignOptions, **asked))
+
+
+def certify(*given: Any, **asked: Any) -> km.guarantees.Certificate:
+    """Return `km.certify` of the model and the data."""
+    return km.certify(*given, **gather(km.guarantees.CertifyOptions, **asked))
