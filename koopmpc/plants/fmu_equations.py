@@ -107,7 +107,8 @@ def read_equations(
         equations = builder.create("unit", ["x", "u"], ["ode", "y"], slopes)
         timed = builder.create("timed", ["t", "x", "u"], ["ode", "y"])  # CasADi 3.8 crashes in its second derivatives
         start, held = (
-            np.array([float(values.get(name, builder.get(name))) for name in group]) for group in (names, all_inputs)
+            np.array([float(values[name] if name in values else builder.get(name)) for name in group])
+            for group in (names, all_inputs)
         )
         _require_autonomous(timed, start, held, unit.file)
         direct = _find_direct_outputs(equations, start, held, len(measured))

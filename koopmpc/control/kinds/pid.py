@@ -5,9 +5,9 @@ and PID controller tuning", J. Process Control 13, 2003 (SIMC).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from time import perf_counter
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -213,9 +213,10 @@ class PID(FeedbackLaw):
     @classmethod
     def from_data(cls: type[_Restored], saved: SavedController) -> _Restored:
         """Return the controller that is made of these data."""
-        build, given, names = cast("Any", cls), dict(saved.options), [field.name for field in fields(PIDOptions)]
-        shape = PIDOptions(**{name: given.pop(name) for name in names})
-        return build(limits=saved.limits, options=shape, **given)
+        build: Any = cls
+        shape = {name: saved.options[name] for name in PIDOptions.__dataclass_fields__}
+        others = {name: value for name, value in saved.options.items() if name not in shape}
+        return build(limits=saved.limits, options=PIDOptions(**shape), **others)
 
     def _forget(self) -> None:
         self._integral, self._derivative = np.zeros(self.nu), np.zeros(self.nu)

@@ -34,23 +34,30 @@ def _is_power_at_zero(a: Range, b: Range) -> bool:
     return not (a[0] > 0 or (b[0] == b[1] and b[0] >= 1 and b[0] % 1 == 0))
 
 
-# operation → its range, from those of its operands
-_RANGES: dict[str, Callable[..., Range]] = {
-    **{name: lambda a: a for name in ("ASSIGN", "LIFT")},
-    **{name: lambda _: (-1.0, 1.0) for name in ("SIN", "COS", "TANH", "ERF", "SIGN")},
-    **{name: lambda _: _ALL for name in ("ASINH", "LOG", "LOG1P")},
-    **{name: lambda *_: (0.0, 1.0) for name in ("NOT", "LT", "LE", "EQ", "NE", "AND", "OR")},
-    **{name: lambda *_: (0.0, inf) for name in ("SQRT", "HYPOT")},
+Rule = Callable[[Range, Range], Range]  # the range of an operation, from those of its operands; one alone comes twice
+
+
+def _between(low: float, high: float) -> Rule:
+    return lambda _, __: (low, high)
+
+
+_RANGES: dict[str, Rule] = {
+    **dict.fromkeys(("SIN", "COS", "TANH", "ERF", "SIGN"), _between(-1.0, 1.0)),
+    **dict.fromkeys(("ASINH", "LOG", "LOG1P"), _between(-inf, inf)),
+    **dict.fromkeys(("NOT", "LT", "LE", "EQ", "NE", "AND", "OR"), _between(0.0, 1.0)),
+    **dict.fromkeys(("SQRT", "HYPOT"), _between(0.0, inf)),
     **dict.fromkeys(("POW", "CONSTPOW"), _power),
-    "NEG": lambda a: (-a[1], -a[0]),
-    "TWICE": lambda a: (2 * a[0], 2 * a[1]),
-    "SQ": _square,
-    "FABS": _absolute,
-    "ATAN": lambda _: (-pi / 2, pi / 2),
-    "FLOOR": lambda a: (a[0] - 1, a[1]),
-    "CEIL": lambda a: (a[0], a[1] + 1),
-    "EXP": lambda a: (0.0, inf if a[1] > _LARGE else exp(a[1])),
-    "INV": lambda a: (0.0, inf) if a[0] > 0 else (-inf, 0.0),
+    "ATAN": _between(-pi / 2, pi / 2),
+    "ASSIGN": lambda a, _: a,
+    "LIFT": lambda a, _: a,
+    "NEG": lambda a, _: (-a[1], -a[0]),
+    "TWICE": lambda a, _: (2 * a[0], 2 * a[1]),
+    "SQ": lambda a, _: _square(a),
+    "FABS": lambda a, _: _absolute(a),
+    "FLOOR": lambda a, _: (a[0] - 1, a[1]),
+    "CEIL": lambda a, _: (a[0], a[1] + 1),
+    "EXP": lambda a, _: (0.0, inf if a[1] > _LARGE else exp(a[1])),
+    "INV": lambda a, _: (0.0, inf) if a[0] > 0 else (-inf, 0.0),
     "ADD": lambda a, b: (a[0] + b[0], a[1] + b[1]),
     "SUB": lambda a, b: (a[0] - b[1], a[1] - b[0]),
     "MUL": _product,
@@ -61,12 +68,12 @@ _RANGES: dict[str, Callable[..., Range]] = {
     "COPYSIGN": lambda a, _: (-_absolute(a)[1], _absolute(a)[1]),
 }
 # operation → condition on its operands under which it, or its slope, is undefined; and the words for it
-_UNDEFINED: dict[str, tuple[Callable[..., bool], str]] = {
-    "SQRT": (lambda a: a[0] <= 0, "a root of what may be 0 or negative"),
-    "LOG": (lambda a: a[0] <= 0, "a logarithm of what may be 0 or negative"),
-    "LOG1P": (lambda a: a[0] <= -1, "a logarithm of what may be 0 or negative"),
-    "EXP": (lambda a: a[1] > _LARGE, "an exponential of what has no upper bound"),
-    "INV": (lambda a: a[0] <= 0 <= a[1], "a division by what may be 0"),
+_UNDEFINED: dict[str, tuple[Callable[[Range, Range], bool], str]] = {
+    "SQRT": (lambda a, _: a[0] <= 0, "a root of what may be 0 or negative"),
+    "LOG": (lambda a, _: a[0] <= 0, "a logarithm of what may be 0 or negative"),
+    "LOG1P": (lambda a, _: a[0] <= -1, "a logarithm of what may be 0 or negative"),
+    "EXP": (lambda a, _: a[1] > _LARGE, "an exponential of what has no upper bound"),
+    "INV": (lambda a, _: a[0] <= 0 <= a[1], "a division by what may be 0"),
     "DIV": (lambda _, b: b[0] <= 0 <= b[1], "a division by what may be 0"),
     "POW": (lambda a, b: b[0] != b[1] or _is_power_at_zero(a, b), "a power of what may be 0, or that is not constant"),
     "CONSTPOW": (_is_power_at_zero, "a power of what may be 0 or negative"),
@@ -99,12 +106,10 @@ def find_undefined_operation(function: ca.Function) -> str | None:
                 return "a constant that is not finite"
             work[written[0]] = value, value
             continue
-        operands = [work[i] for i in read]
-        fails, reason = _UNDEFINED.get(name, (None, ""))
+        a, b = work[read[0]], work[read[-1]]
         if name not in _RANGES:
             return f"CasADi's operation {name}"
-        if fails is not None and fails(*operands):
-            return reason
-        same = name == "MUL" and read[0] == read[1]
-        work[written[0]] = _square(operands[0]) if same else _RANGES[name](*operands)
+        if name in _UNDEFINED and _UNDEFINED[name][0](a, b):
+            return _UNDEFINED[name][1]
+        work[written[0]] = _square(a) if name == "MUL" and read[0] == read[1] else _RANGES[name](a, b)
     return None

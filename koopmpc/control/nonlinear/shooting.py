@@ -160,10 +160,11 @@ class Shooting:
         U, X, E = ca.vertsplit(ca.DM(self._sizes) * W, [0, *self._split, len(self._sizes)])
         x0, e, schedule = (ca.MX.sym("p", *size) for size in ((p.nx, 1), (p.moved, N), (p.scheduled, N)))
         targets, diagonals, states = target_symbols(p), weight_symbols(p), ca.horzcat(x0, X)
-        self.weights = tuple(
+        Q, R = (
             np.tile(full.diagonal(), (N, int(given.numel() > 0)))
             for full, given in zip((p.Q, p.R), diagonals, strict=True)
         )
+        self.weights = Q, R
         f = sum_costs(p, states, U, targets, diagonals)
         ahead = F.map(N)(states[:, :N], U, schedule) + ca.vertcat(e, ca.MX(p.nx - p.moved, N))
         gaps, path = W[nu : nu + p.nx, :] - ahead / ca.DM(p.sizes), ca.MX(0, N)
@@ -200,8 +201,9 @@ class Shooting:
 
     def _bound(self, p: StagedProblem, ns: int) -> None:
         """Set the bounds of the variables and of the constraints (see `_stack`), and how both are shifted."""
-        (N, nu), nx, ng = p.held_from.shape, p.nx, len(p.box.low)
-        places, path = np.arange(N)[:, None] * (nx + 2 * ng), 2 * ng
+        N, nu, nx, ng = len(p.held_from), p.held_from.shape[1], p.nx, len(p.box.low)
+        path = 2 * ng
+        places = np.arange(N)[:, None] * (nx + path)
         gap_at = places - path + np.arange(nx)
         gap_at[0] += path
         path_at = places + nx + nx + np.arange(path)
