@@ -182,7 +182,7 @@ def distinct(*lists: Sequence[str]) -> None:
 
 
 def texts(given: object, what: str) -> tuple[str, ...]:
-    """Return a sequence of names as a tuple; refuse a single text, and what is no text."""
+    """Return a sequence of names as a tuple; refuse a single text, and entries of another type."""
     try:
         found = tuple(cast("Iterable[object]", given))
     except TypeError:  # an array without dimensions is an Iterable too
@@ -312,7 +312,7 @@ def numbers(value: ArrayLike | None, name: str) -> Float[np.ndarray, "..."]:
 
 
 def check_named(given: Any, what: str, *, infinite: bool = False) -> dict[str, float]:
-    """Return the numbers by name; refuse a name that is no text, and a value that is no number."""
+    """Return the numbers by name; refuse names of another type than text, and values of another type than number."""
     wrong = next((name for name in given if not isinstance(name, str)), None)
     if wrong is not None or not given:
         raise DataError(f"{what} is {given!r}; pass names of signals with their numbers, as {{'theta': 10}}")

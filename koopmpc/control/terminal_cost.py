@@ -199,8 +199,8 @@ def learned_steps(
     only follows the model's errors: modes that the plant does not have grow in it until they rule the plan. Both are
     root mean squares over the data about their mean; inputs count by S = L Lᵀ, what they cost. The gain rests when the
     change is so small for as many steps in a row as ψ has arguments; it is waited for T = 10 N steps, 200 at least.
-    Then `believed_steps` shortens the tail, but for models of delays and reduced ones. Where the gain does not rest, or
-    a model does not know its errors, it has N steps. `inverse` takes z into other coordinates of the stage.
+    Then `believed_steps` shortens the tail, except for models of delays and reduced ones. Where the gain does not rest,
+    or a model does not know its errors, it has N steps. `inverse` takes z into other coordinates of the stage.
     """
     scale = predictor.scale
     if predictor.report is None or scale is None:
@@ -224,7 +224,7 @@ def believed_steps(
     """Return the shortest tail of none, N, `most`, a half, a quarter … of these steps, down to N/4, that is as good.
 
     Without limits, N planned steps and a tail are a law u = −K z. Each law steers the re-lifted model
-    x⁺ = C (A ψ(x) + B u) for T steps from a standard deviation along each principal axis of the states, all counted
+    x⁺ = C (A ψ(x) + B u) for T steps from a standard deviation along each principal axis of the states. States count
     from the mean of the data, which is taken to be at rest. A law that leans on modes of A that lifted states do not
     have costs there what it would on the plant. Inputs act half a step late, which a law pays for that leans on fast
     modes, those of the model's errors above all. What little a longer tail gains on the model need not be gained on the

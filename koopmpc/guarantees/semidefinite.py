@@ -35,7 +35,7 @@ _SOLVED = ("optimal", "optimal_inaccurate")  # the solver's word is checked afte
 class FeedbackTask:
     """What the program is about, in coordinates in which entries of φ and v are about one."""
 
-    # A, B, N: (n, n), (n, m) and (n, m n); N is None for a linear model
+    # A, B, N: (n, n), (n, m) and (n, m n); a linear model has no N
     A: Float[np.ndarray, "n n"]
     B: Float[np.ndarray, "n m"]
     N: Float[np.ndarray, "n mn"] | None

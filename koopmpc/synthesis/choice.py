@@ -100,7 +100,7 @@ def choose_row(rows: Sequence[DesignRow], kind: str | None = None, *, unstable: 
 
 
 def _choose_among_estimators(rows: Sequence[DesignRow], same: Sequence[int], place: int, unstable: bool) -> int:
-    """Return the row whose estimator is worth its cost, of the rows of one recipe but for it; see `choose_row`."""
+    """Return the row whose estimator is worth its cost; the rows differ in it alone. See `choose_row`."""
 
     def admit(i: int, worth: float) -> bool:
         return rows[i].score <= (1 + worth) * rows[place].score

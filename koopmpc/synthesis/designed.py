@@ -56,7 +56,7 @@ class Evidence(Value):
         Some of the data, not smoothed, with which new logs are compared; their inputs stand where the model has them.
         None in files of earlier designs.
     promise
-        The promised share of loops that keep their limits; None if the margin is no share of loops.
+        The promised share of loops that keep their limits; None for a margin of another kind.
     """
 
     _FORMER: ClassVar = {"asked": "task"}
@@ -175,7 +175,7 @@ class Design:
 
     @property
     def promise(self) -> CoveragePromise | None:
-        """The promised share of loops that keep their limits; None if the margin is no share of loops."""
+        """The promised share of loops that keep their limits; None for a margin of another kind."""
         return self.evidence.promise
 
     def save(self, path: str | Path, *, logs: LogSummary | None = None) -> None:

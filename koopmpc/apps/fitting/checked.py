@@ -86,7 +86,7 @@ class Checked:
     doubts: tuple[str, ...] = ()  # where nobody can say whether it is kept, for there are no data
     compared: ComparedLogs | None = None  # what new logs say, where they are given
     rate: LoopRate | None = None  # exact bound on the share of fresh loops that break a limit or are lost
-    plant: LoopRate | None = None  # the same of logged runs on the plant, where they are given
+    plant: LoopRate | None = None  # the rate of logged runs on the plant, where the caller has some
     remarks: tuple[str, ...] = ()  # which runs end off the reference with other noise or inputs; they do not count
     cost_steps: int = 0  # a cost is the sum over so many steps, the first of a run
     wished: float = 0.05  # the bound that the number of fresh loops was chosen for

@@ -172,7 +172,7 @@ LIMIT_CHECKS: dict[str, Callable[[Any, str], Any]] = {
 """Field of `Limits` → what checks a value of it, and returns what is stored."""
 
 
-def refuse_crossed(limits: Any, ends: Sequence[str]) -> None:
+def refuse_crossed_limits(limits: Any, ends: Sequence[str]) -> None:
     """Raise where one of these bounds crosses the other end of its pair, or is of the wrong sign."""
     for low, high, name in ENDS:
         pair = getattr(limits, low), getattr(limits, high)

@@ -28,7 +28,7 @@ from koopmpc.control.ask.bounds import measure_violation as measure_violation
 from koopmpc.control.ask.bounds import preview_margin as preview_margin
 from koopmpc.control.ask.bounds import spread_prices, write_rows
 from koopmpc.control.ask.checks import BOUNDS as BOUNDS
-from koopmpc.control.ask.checks import ENDS, LIMIT_CHECKS, refuse_crossed, refuse_margin
+from koopmpc.control.ask.checks import ENDS, LIMIT_CHECKS, refuse_crossed_limits, refuse_margin
 from koopmpc.control.ask.levels import DwellByInput, InputLevels, LevelsByInput, build_levels
 from koopmpc.control.ask.terminal import HasTerminalSet, TerminalSet
 from koopmpc.lifting.base import Lifting, strip_unit
@@ -134,7 +134,7 @@ class Limits(Value):
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, check(value, name))
-        refuse_crossed(self, BOUNDS)
+        refuse_crossed_limits(self, BOUNDS)
         refuse_margin(self)
 
     def resolve(self, states: Sequence[str], inputs: Sequence[str]) -> "Limits":
@@ -192,7 +192,7 @@ class Limits(Value):
         other = copy(self)
         for end, value in ends.items():
             object.__setattr__(other, end, None if value is None else bounds.check_limit(value, end))
-        refuse_crossed(other, tuple(ends))
+        refuse_crossed_limits(other, tuple(ends))
         if "x_min" in ends or "x_max" in ends:
             refuse_margin(other)
         return other

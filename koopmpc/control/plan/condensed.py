@@ -223,7 +223,7 @@ def plan_matrices(
     maps = condense(scaled_horizon, law, terminal, aims, units, coordinates, end)
     if tied:
         maps = tie_moves(maps, moves.held)
-    if track.pull is not None:  # an end of one's own does not count the price
+    if track.pull is not None:  # a user's own end leaves the price out
         counted = horizon.N + (track.cost.Q_N is None)
         pulled = np.concatenate([np.tile(track.pull, counted), np.zeros((horizon.N + 1 - counted) * len(track.pull))])
         maps = replace(maps, offset=maps.offset + maps.from_reference @ pulled)

@@ -95,13 +95,13 @@ class Tracking(Generic[Read]):
 
     Both are matrices (nr, nz) and (ng, nz) on a lifted state, or functions of x. Rows without a limit are left out.
     `softness` says what it costs to leave `outputs`, row by row; a linear weight of inf makes a row hard. `margin`
-    moves `outputs` inwards, see `Limits`. R_delta is None without a weight of input changes, `rates` without a limit;
-    `with_rates` says whether there is either. `hard_rates` are those of `SizedLimits`. `given` are the rows of a
-    u_target that is given as numbers, None for one by name. `Q_root` and `R_root` are S with SᵀS = Q and R. `sizes` are
-    those of states, inputs, limits and cost. Where limits have rows, all these are of their widest values, and
-    `movable` says which inputs, rates and outputs [x; of(x)] have a limit, or may get one. `levels` are those of the
-    inputs. `shift` is what a price adds to u_r, `pull` what an output price adds to the reference; `weighed` says that
-    weights move in time.
+    moves `outputs` inwards, see `Limits`. Without a weight of input changes R_delta is None; without a limit of
+    them `rates` is None; `with_rates` says whether there is either. `hard_rates` are those of `SizedLimits`.
+    `given` are the rows of a u_target that is given as numbers, None for one by name. `Q_root` and `R_root` are S
+    with SᵀS = Q and R. `sizes` are those of states, inputs, limits and cost. Where limits have rows, all these are
+    of their widest values, and `movable` says which inputs, rates and outputs [x; of(x)] have a limit, or may get
+    one. `levels` are those of the inputs. `shift` is what a price adds to u_r, `pull` what an output price adds to
+    the reference; `weighed` says that weights move in time.
     """
 
     cost: Cost

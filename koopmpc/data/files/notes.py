@@ -69,7 +69,7 @@ def name_resampled(caught: Sequence[ResampledWarning]) -> str:
 
 
 def join_warnings(caught: Iterable[Warning], places: Sequence[str]) -> list[Warning]:
-    """Return the warnings; those that say the same of several of the places, or name rows interpolated, as one."""
+    """Return the warnings; equal ones of several places become one, and so do those of interpolated rows."""
     groups: dict[tuple[type[Warning], str], list[tuple[str, Warning]]] = {}
     for one in caught:
         file, _, text = str(one).partition(": ")

@@ -136,7 +136,7 @@ def run_freely(
     return np.where(np.isnan(out), _LOST, out)
 
 
-def is_calm(models: Models, pieces: Pieces, first: int) -> Bool[np.ndarray, " s"]:
+def are_calm(models: Models, pieces: Pieces, first: int) -> Bool[np.ndarray, " s"]:
     """Return which models stay within three times the range of the data, run over each piece twice."""
     twice = [np.vstack([u, u]) for u in pieces.U]
     out = run_freely(models, pieces.Y, twice, first)

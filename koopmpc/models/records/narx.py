@@ -23,7 +23,7 @@ from koopmpc.models.records.forward import (
     select_forward,
     solve_nested,
 )
-from koopmpc.models.records.free_run import Models, Pieces, embed_rows, is_calm, run_freely
+from koopmpc.models.records.free_run import Models, Pieces, are_calm, embed_rows, run_freely
 from koopmpc.models.records.structure import (
     EXACT,
     Structure,
@@ -239,7 +239,7 @@ def _try_plan(
         errors += _unseen_errors(models, pieces, [(max(a, first), b) for a, b in out], first, horizon)
     table = np.array(errors)
     models = fits.fit(sizes, [(0, 0)] * len(pieces.U))
-    calm = is_calm(models, pieces, first)
+    calm = are_calm(models, pieces, first)
     for i, size in enumerate(sizes):
         chosen = tuple(own[:size] for own in models.terms)
         yield Structure(delays, degree, chosen, pieces.mean, pieces.scale, table[:, i], bool(calm[i]), rails, masked)

@@ -57,8 +57,8 @@ def minimise(
     """Return the Θ on the way down the error of `fitted` that has the least error on `judged`, and its iteration.
 
     Only the entries at the places `free` change. `patience` counts steps in a row that do not gain on `judged`,
-    `converged` is the share of the error of `fitted` that a step has to gain, and `project` returns the Θ that may be
-    taken in place of that of a step, where no step itself lowers the error.
+    and `converged` is the share of the error of `fitted` that a step has to gain. Where no step lowers the error,
+    `project` returns the Θ to try in its place.
     """
     theta = best = start
     places = np.arange(theta.size) if free is None else free

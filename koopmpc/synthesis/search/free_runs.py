@@ -78,7 +78,7 @@ def judge_free_run(
 
 
 def leave_quarters(learned: Episodes, truth: Episodes, first: int) -> Iterator[tuple[list[tuple[int, int]], Episodes]]:
-    """Yield the rows of each quarter of the records, and what is left of them without it, in parts that have a past."""
+    """Yield the rows of each quarter of the records, and the other rows, in parts that have a past."""
     for fold in range(FOLDS):
         spans = [(len(e) * fold // FOLDS, len(e) * (fold + 1) // FOLDS) for e in truth]
         sides = [(e, ends) for e, (a, b) in zip(learned, spans, strict=True) for ends in ((0, a), (b, len(e)))]

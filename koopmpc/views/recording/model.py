@@ -114,7 +114,7 @@ def record_model(
 def _find_trust(
     predictor: AnyPredictor, episodes: Episodes, horizon: int, report: TrustReport | None
 ) -> tuple[Score, Bands, ResidualDMD | None, bool]:
-    """Return the errors, the bands and the residuals that are shown, and whether forecasts are lifted anew."""
+    """Return the errors, the bands and the residuals to show, and whether forecasts are lifted again at each step."""
     if report is not None:
         return report.score, report.band, report.residuals, report.band.relift
     relift = isinstance(predictor, BilinearPredictor)

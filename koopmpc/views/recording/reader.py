@@ -63,7 +63,8 @@ def load_run(path: str | Path) -> Run:
 
 def _warn_of_cut(path: Path, steps: int, planned: int | None) -> None:
     """Warn that a log was cut, or not closed."""
-    said = f"{path} ends after step {steps}{'' if planned is None else f' of {planned}'}: the file was cut short or "
+    of = "" if planned is None else f" of {planned}"
+    said = f"{path} ends after step {steps}{of}: the file was cut short or "
     said += "its writer did not close it; the run holds what is there"
     if steps == planned:
         said = f"{path}: its end is cut, all {steps} steps are there"
