@@ -245,6 +245,7 @@ def open_sweep(folder: Path, asked: Mapping[str, Any]) -> Generator[Store]:
                         f"another process runs a sweep in {folder}; wait for it, or pass another folder"
                     ) from error
                 raise
+            file.execute("PRAGMA busy_timeout = 60000")  # [ms] wait for those who read while a run is written
             file.execute(_TABLE)
             store = Store(file, path)
         if store.about is not None and store.about["asked"] != asked:
@@ -306,6 +307,8 @@ def _read_texts(file: sqlite3.Connection, path: Path) -> dict[str, dict[str, Any
     """Return the texts whose checksums are right; warn of the others, and of a file whose parts do not fit."""
     contents: dict[str, dict[str, Any]] = {}
     damaged = 0
+    if not file.execute("SELECT count(*) FROM sqlite_schema WHERE name = 'texts'").fetchone()[0]:
+        return contents  # the sweep was broken off before it wrote
     for name, text, check in file.execute("SELECT name, text, checksum FROM texts"):
         if isinstance(name, str) and isinstance(text, str) and checksum(name.encode(), text.encode()) == check:
             contents[name] = json.loads(text)

@@ -26,11 +26,10 @@ from koopmpc.control.plan.task import ControlTask, tie_moves
 from koopmpc.control.plan.tracking import EndRows, LiftedTracking, read_end, soften_end
 from koopmpc.control.program import no_export, reference_table, refuse_time_limit
 from koopmpc.control.riccati import Law, Stage, recursion
-from koopmpc.control.solvers import FINISHER
+from koopmpc.control.solvers import FINISHER, order
 from koopmpc.control.solvers.ball import make_ball
 from koopmpc.control.solvers.base import StepQP
 from koopmpc.control.solvers.daqp import daqp_settings
-from koopmpc.control.solvers.order import LONG, SPARSE
 from koopmpc.control.solvers.priorities import spread_priorities
 from koopmpc.control.solvers.stages import QPStages
 from koopmpc.control.target import ROUNDING, Targets, Units, targets_of
@@ -230,7 +229,7 @@ def plan_matrices(
     scaled = _scale_deviation(maps, track.inputs, len(moves.lengths))
     stages = None
     plain = not (tied or track.weighed) and end is None and len(horizon.blocks) == horizon.N
-    if (task.solver == SPARSE or task.N >= LONG) and plain and maps.coordinates == "riccati":
+    if (task.solver == order.SPARSE or task.N >= order.LONG) and plain and maps.coordinates == "riccati":
         columns = np.diagonal(scaled.deviation) / np.diagonal(maps.deviation)
         stages = _keep_stages(scaled_horizon, parts[0], law, terminal.P, units, columns, units.scale / scaled.unit)
     limits = limit_plan(track, horizon, scaled.deviation, end, moves.held)
