@@ -21,7 +21,7 @@ from koopmpc.data.files.npz import describe_episodes, split_rows, stack_episodes
 from koopmpc.data.source import Part
 
 _KEY = b"koopmpc.episodes"  # metadata of the file: sample time and names
-_CHECK = b"koopmpc.check"  # metadata of the file: checksum of its names and numbers, for pages alone have others
+_CHECK = b"koopmpc.check"  # metadata of the file: checksums of its blocks of rows, each with the names
 _PLACES = ("episode", "step")  # columns that say where a row stands
 _GROUP = 8_000_000  # bytes of a group of rows, about
 _LARGE = 32_000_000  # bytes from which a file is read in groups of rows
@@ -48,15 +48,34 @@ def write_parquet(stream: BinaryIO, episodes: Episodes) -> None:
     columns += [pa.array(column, mask=last) for column in full.T]
     table = pa.table(columns, names=[*_PLACES, *names])
     rows = max(_GROUP // (8 * len(columns)), 1)
-    check = json.dumps({"crc32": [_checksum(about, episode, step, X, full)]})
+    check = json.dumps({"rows": rows, "crc32": _checksums(about, rows, 0, np.column_stack([episode, step]), X, full)})
     table = table.replace_schema_metadata({_KEY: about.encode(), _CHECK: check.encode()})
     pq.write_table(table, stream, row_group_size=rows, write_page_checksum=True)
 
 
-def _checksum(about: str, episode: np.ndarray, step: np.ndarray, X: np.ndarray, U: np.ndarray) -> int:
-    """Return the checksum of a whole file's metadata and numbers; inputs that are null count as 0."""
-    columns = np.column_stack([episode, step]), X, np.nan_to_num(U)
-    return checksum(*(np.ascontiguousarray(some).data for some in columns), start=checksum(about.encode()))
+def _checksums(about: str, size: int, first: int, *columns: np.ndarray) -> list[int]:
+    """Return a checksum of each whole block of `size` rows and of the metadata; `first` is the number of the first row.
+
+    Pages have checksums of their own, but names, sizes and the places of pages have none.
+    """
+    seed, blocks = checksum(about.encode()), range(-first % size, len(columns[0]), size)
+    whole = [np.ascontiguousarray(some) for some in columns]
+    return [checksum(*(some[at : at + size].data for some in whole), start=seed) for at in blocks]
+
+
+def _verify(table: Any, named: Mapping[str, Any], first: int = 0, rows: int | None = None) -> None:
+    """Raise where rows of a file, the first of them number `first` of `rows`, are not those that were written."""
+    check = json.loads(table.schema.metadata[_CHECK])
+    size, rows = int(check["rows"]), len(table) if rows is None else rows
+    places = np.stack([table[name].to_numpy() for name in _PLACES], axis=1)
+    U = np.nan_to_num(_stack(table, named["inputs"] + named["disturbances"]))
+    sums = _checksums(table.schema.metadata[_KEY].decode(), size, first, places, _stack(table, named["states"]), U)
+    if (first + len(table)) % size and first + len(table) < rows:  # the last block is not whole
+        sums.pop()
+    begin = -(-first // size)
+    written = check["crc32"][begin : begin + len(sums)] if first + len(table) < rows else check["crc32"][begin:]
+    if sums != written:
+        raise ValueError("its numbers are not those that were written; take another copy")
 
 
 def read_parquet(file: Path) -> Episodes | LogTable:
@@ -74,9 +93,7 @@ def read_parquet(file: Path) -> Episodes | LogTable:
         if not np.array_equal((episode, step), _positions(steps)):
             raise ValueError("rows are missing or out of order")
         X, U = _stack(table, named["states"]), _stack(table, named["inputs"] + named["disturbances"])
-        check = json.loads(table.schema.metadata.get(_CHECK, b"{}"))
-        if check.get("crc32") != [_checksum(about, episode, step, X, U)]:
-            raise ValueError("its numbers are not those that were written; take another copy")
+        _verify(table, named)
         return split_rows(X, U[step != steps[episode]], steps, about)
     except (KeyError, TypeError, ValueError) as error:
         raise LogError(f"{file} {_DAMAGED}: {error}; {ADVICE}") from error
@@ -104,6 +121,7 @@ def _read_rows(file: Path, stretches: list[tuple[int, int]], plant: PlantSignatu
             if np.ptp(episode[a : b + 1]) or (np.diff(step[a : b + 1]) != 1).any():
                 raise ValueError("rows are missing or out of order")
             found.append(Episode(X=X[a : b + 1], U=U[a:b], W=W[a:b]))
+        _verify(table, named, before, int(ends[-1]))
         episodes = Episodes(found, named["dt"], named["states"], named["inputs"], disturbances)
     except (KeyError, IndexError, TypeError, ValueError, OSError, pa.ArrowException) as error:
         raise LogError(f"{place} holds no episodes that can be read: {error}") from error

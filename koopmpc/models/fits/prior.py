@@ -128,7 +128,7 @@ class Prior(Value):
 
     A: ArrayLike | None = None
     B: ArrayLike | None = None
-    rows: Mapping[str, Mapping[str, float]] = field(default_factory=dict[str, Mapping[str, float]])
+    rows: Mapping[str, Mapping[str, float]] | None = None
     mask_A: ArrayLike | None = None
     mask_B: ArrayLike | None = None
     lower_A: ArrayLike = -np.inf
@@ -140,8 +140,9 @@ class Prior(Value):
     dissipation: Dissipation | None = None
 
     def __post_init__(self) -> None:
-        checks.kind(self.rows, "rows", Mapping, 'pass {"x [m]": {"v [m/s]": 0.1}}')
-        for name, row in self.rows.items():
+        rows = self.rows or {}
+        checks.kind(rows, "rows", Mapping, 'pass {"x [m]": {"v [m/s]": 0.1}}')
+        for name, row in rows.items():
             checks.kind(row, f"rows[{name!r}]", Mapping, 'pass {"v [m/s]": 0.1}')
         checks.kind(self.symmetric, "symmetric", (bool, np.bool_), "pass True or False")
         checks.kind(self.combinations, "combinations", (tuple, list), "pass a list of Combination")
@@ -149,7 +150,7 @@ class Prior(Value):
             checks.kind(each, "an entry of combinations", Combination, "pass a list of Combination")
         known = {
             name: {other: float(checks.array(v, f"rows[{name!r}]", ())) for other, v in row.items()}
-            for name, row in self.rows.items()
+            for name, row in rows.items()
         }
         _check_matrices(self, "Prior.A", "Prior.B", finite=False)
         _check_matrices(self, "mask_A", "mask_B")
@@ -190,7 +191,7 @@ def build_entries(prior: Prior, observables: Sequence[str], inputs: Sequence[str
         if values is not None:
             _write_known(known[:, columns], values, f"Prior.{name}")
     names = [*observables, *inputs]
-    for name, row in prior.rows.items():
+    for name, row in (prior.rows or {}).items():
         values = np.zeros((1, nz + nu))
         for other, value in row.items():
             values[0, _find_name(other, names)] = value

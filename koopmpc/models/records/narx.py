@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from itertools import product
-from typing import Protocol, TypeVar, Unpack
+from typing import Protocol, TypeVar, Unpack, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -48,6 +48,7 @@ _NEAR = np.array([[1e-9], [-1e-9]])  # spreads from a rail that rounding makes
 _MEDIAN = 0.1  # log of the ratio by which the errors of half of the blocks may be larger
 
 
+@runtime_checkable
 class _Judged(Protocol):
     """What has errors on blocks of unseen rows."""
 
