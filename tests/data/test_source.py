@@ -267,19 +267,29 @@ def test_sample_times_agree_to_a_millionth(share: float) -> None:
             read(km.data.Stream([one, other]))
 
 
-def test_a_number_that_was_changed_is_told_wherever_it_is(tmp_path: Path) -> None:
+def test_a_row_group_that_was_changed_is_told_wherever_the_change_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each block of rows has its own checksum, and the last one may hold fewer rows."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    data = random_episodes(0, [20, 7, 12, 10], 2, 1)
+    monkeypatch.setattr("koopmpc.data.files.parquet._GROUP", 8 * 5 * 16)  # sixteen rows of five columns
+    monkeypatch.setattr("koopmpc.data.files.parquet._LARGE", 0)
+    data = random_episodes(0, [20, 7, 12, 10], 2, 1)  # 53 rows: three blocks and five rows
     data.save(tmp_path / "whole.parquet")
     table = pq.read_table(tmp_path / "whole.parquet")
     assert km.load_episodes(tmp_path / "whole.parquet") == data
-    for row, name in ((0, "x0"), (16, "x1"), (47, "u0"), (52, "x1")):
-        column = table[name].to_numpy().copy()
-        column[row] += 1e-9
-        place = table.column_names.index(name)
-        changed = table.set_column(place, table.schema.field(name), pa.array(column, mask=np.isnan(column)))
-        pq.write_table(changed, tmp_path / "changed.parquet")
-        with pytest.raises(km.errors.LogError, match="its numbers are not those that were written"):
-            km.load_episodes(tmp_path / "changed.parquet")
+    for row in (0, 15, 16, 47, 48, 52):
+        for name in (data.states[0], data.states[1], data.inputs[0]):
+            column = table[name].to_numpy().copy()
+            if np.isnan(column[row]):
+                continue  # the input of the last row of an episode
+            column[row] += 1e-9
+            place = table.column_names.index(name)
+            changed = table.set_column(place, table.schema.field(name), pa.array(column, mask=np.isnan(column)))
+            pq.write_table(changed, tmp_path / "changed.parquet", row_group_size=16)
+            with pytest.raises(km.errors.LogError, match="its numbers are not those that were written"):
+                km.load_episodes(tmp_path / "changed.parquet")
+            with pytest.raises(km.errors.LogError, match="its numbers are not those that were written"):
+                km.dmdc(km.data.Files([tmp_path / "changed.parquet"]))

@@ -1,6 +1,6 @@
 """fit_data: from a file or a folder of logs to a model file, with its report, its pictures and its Rerun log."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -106,7 +106,7 @@ def fit_data(data: Data, folder: Path, asked: FitOptions, say: Say, progress: St
 def _write_page(
     page: Page,
     texts: tuple[str, str, str, str],
-    pictures: Iterator[tuple[str, str, Callable[[], Any]]],
+    pictures: Iterable[tuple[str, str, Callable[[], Any]]],
     failures: list[str],
 ) -> Path:
     """Write the report of verdict, usage, data and choice, with its pictures; add those that fail to `failures`."""
