@@ -101,6 +101,7 @@ REFUSED = [
 ]
 
 
+@pytest.mark.unhooked
 @pytest.mark.parametrize(("error", "words", "call"), REFUSED, ids=[words for _, words, _ in REFUSED])
 def test_what_is_refused_is_named(error, words, call):
     with pytest.raises(error) as raised:
