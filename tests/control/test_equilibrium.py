@@ -158,7 +158,7 @@ def test_ipopt_is_asked_once_for_rows_that_equilibria_hold(monkeypatch):
     monkeypatch.setattr(targets.equilibria, "find", lambda row: asked.append(row) or own(row))
     t = np.linspace(0, 3, 60)
     rows = np.column_stack([0.8 + 0.6 * np.sin(t), 0.7 + 0.5 * np.cos(t)])  # some ask for more than the limits allow
-    followed = targets.find(rows)[0] + targets.find([np.array([0.1, 0.1])])[0]  # far from the last row, and held
+    followed = targets.find(list(rows))[0] + targets.find([np.array([0.1, 0.1])])[0]  # far from the last row, and held
     assert len(asked) == 1
     for target in followed:
         alone = find(row_targets(two_tanks(), TANK_BOX), target.row)
