@@ -49,7 +49,7 @@ class FeedbackSettings:
 SETTINGS = FeedbackSettings()
 _UNUSED = "the set points are not used, and models are fitted by plain least squares"
 _PLAIN = State() + Constant()
-_Rows = Float[np.ndarray, "rows nr"] | None
+_Rows = Float[np.ndarray, "_ nr"] | None
 _Size = Float[np.ndarray, " nx"]
 
 
