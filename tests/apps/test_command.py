@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -96,7 +97,9 @@ def test_the_command_prints_verdicts_and_paths_and_fails_where_a_required_number
 
     paper = registry.make_paper("mine", "Mine and yours.\n\nA paper\nof ours.\n", work)
     monkeypatch.setattr(registry, "PAPERS", ("mine",))
-    monkeypatch.setattr(registry, "import_module", lambda name: type("M", (), {"paper": paper}))
+    module = ModuleType("mine")
+    module.paper = paper
+    monkeypatch.setattr(registry, "import_module", lambda name: module)
     result = koopmpc("reproduce", "mine", "--logs", tmp_path)
     assert result.exit_code == code, result.output
     for word in ("Mine and yours", "it works", "does not hold", "half of it", "mine.md", "mine.rrd", "done in"):
