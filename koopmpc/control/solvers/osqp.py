@@ -10,7 +10,8 @@ copies of the problem.
 Stellato et al., "OSQP: an operator splitting solver for quadratic programs", Math. Prog. Comp. 12, 2020.
 """
 
-from collections.abc import Mapping
+import signal
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any, ClassVar
 
@@ -123,7 +124,7 @@ class OSQP(QPSolver):
         self._solver.update_data_vec(q=None, l=self.low, u=self.high)
         self._allow(self._time_limit if time_limit is None else time_limit)
         self._solver.warm_start(np.ascontiguousarray(v), np.ascontiguousarray(y))
-        call_uninterrupted(self._solver.solve)  # OSQP takes a SIGINT for itself
+        _solve_uninterrupted(self._solver.solve)
         info, solution = self._solver.info, self._solver.solution
         status = self._status.get(int(info.status_val), Status.FAILED)
         if status is Status.MAX_ITERATIONS and info.iter < self._most:  # nearly solved when its time was over
@@ -139,3 +140,24 @@ class OSQP(QPSolver):
         if seconds != options.time_limit:
             options.time_limit = seconds
             self._solver.update_settings(options)
+
+
+@cache
+def _load_interrupt_flag() -> Callable[[], int]:
+    """Return OSQP's own function that says whether a SIGINT came during the last solve."""
+    from ctypes import CDLL
+
+    from osqp import ext_builtin
+
+    return getattr(CDLL(ext_builtin.__file__), "osqp_is_interrupted", lambda: 0)  # Windows exports no such name
+
+
+def _solve_uninterrupted(solve: Callable[[], object]) -> None:
+    """Solve while SIGINT waits.
+
+    OSQP takes the signal for itself. In a program with threads another thread may still receive it; OSQP then ends
+    with a status that says so, or forgets it in its last iteration. It is therefore sent once more.
+    """
+    call_uninterrupted(solve)
+    if _load_interrupt_flag()():
+        signal.raise_signal(signal.SIGINT)
