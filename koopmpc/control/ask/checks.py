@@ -111,8 +111,9 @@ def refuse_contradictions(cost: Any) -> None:
     """Raise where fields of a cost contradict each other."""
 
     def is_full(weight: Any) -> bool:
-        is_matrix = not isinstance(weight, Mapping) and np.ndim(weight) == 2
-        return is_matrix and bool((weight != np.diag(np.diagonal(weight))).any())
+        if isinstance(weight, Mapping) or np.ndim(weight) != 2:
+            return False
+        return bool((weight != np.diag(np.diagonal(weight))).any())
 
     rows = next((name for name in ("Q_rows", "R_rows") if getattr(cost, name) is not None), None)
     full = None if rows is None else next((name for name in ("Q", "R") if is_full(getattr(cost, name))), None)
