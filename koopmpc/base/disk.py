@@ -5,6 +5,7 @@ An interrupt, an error or a full disk in the middle of a save leaves the file th
 
 import errno
 import io
+import math
 import os
 import secrets
 import shutil
@@ -24,6 +25,7 @@ from koopmpc.base.errors import DataError, FullDiskError, LogError
 from koopmpc.base.interrupts import raise_swallowed
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_DEFLATED = 1100  # deflate makes a member at most 1032 times smaller
 PART = ".part"  # ends the name of a file that is being written
 
 
@@ -135,8 +137,8 @@ class _Stream(io.FileIO):
 class Members:
     """The arrays of a .npz file, each read when it is asked for; the others take no memory.
 
-    A pickle is never opened. Before an array is allocated, its member must fit into memory; the checksum of a member
-    covers all of it.
+    A pickle is never opened. Before an array is allocated, its size must be what its member holds, and fit into
+    memory; the checksum of a member covers all of it.
 
     Raises
     ------
@@ -161,6 +163,13 @@ class Members:
         """Return the array; ValueError where it is damaged or too large."""
         info = self._infos[name]
         affordable(info.file_size, info.filename)
+        with _translate_errors(), self._zip.open(info) as stream:
+            version = np.lib.format.read_magic(stream)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(stream)
+            held = stream.tell() + math.prod(shape) * dtype.itemsize
+            if held != info.file_size or held > _DEFLATED * info.compress_size:
+                raise ValueError("the array is not of the size of its member")
         with _translate_errors(), self._zip.open(info) as stream:
             array = np.lib.format.read_array(stream, allow_pickle=False)
             if stream.read(1):  # at the end of the member its checksum was compared

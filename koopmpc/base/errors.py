@@ -121,7 +121,7 @@ def refuse_moved(
     for word in keywords:
         if word in places:
             raise TypeError(f"{word}= is a field of the options now: pass options={name}({places[word]})")
-        raise TypeError(f"there is no argument {word}=")
+        raise TypeError(f"there is no argument {word}=, and {name} has no such field")
 
 
 class Hint:

@@ -80,9 +80,8 @@ def _serve_loaded(package: str, home: Mapping[str, str]) -> None:
     names = loaded[package].__dict__
     for name, file in home.items():
         value = getattr(loaded[file], name) if file in loaded else None
-        if (
-            value is not None and names.get(name) is not value
-        ):  # or the file itself, which has the same name, stands there
+        # the file itself may stand there, under the same name
+        if value is not None and names.get(name) is not value:
             shorten_annotations(value)
             names[name] = value
 

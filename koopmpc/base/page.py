@@ -133,8 +133,9 @@ class Page:
             f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
             f'<meta name="viewport" content="width=device-width,initial-scale=1"><title>{escape(self.title)}</title>'
         )
+        style = Path(__file__).with_name("page.css").read_text("utf-8")
         body = f"<h1>{escape(self.title)}</h1>{''.join(part.html for part in self.parts)}"
-        return f'<!doctype html><html lang="en"><head>{head}<style>{_STYLE}</style></head><body>{body}</body></html>\n'
+        return f'<!doctype html><html lang="en"><head>{head}<style>{style}</style></head><body>{body}</body></html>\n'
 
     def write(self, name: str = "report.md") -> Path:
         """Write the report into `folder`, as HTML where the name ends in .html, and return its path.
@@ -151,4 +152,3 @@ class Page:
 
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"  # a browser loads nothing from elsewhere
-_STYLE = Path(__file__).with_name("page.css").read_text("utf-8")

@@ -1,4 +1,4 @@
-"""What predictive controllers share beside their step: names, files, copies; the base of those that plan in stages."""
+"""What predictive controllers share beside their step: names, a monitor, files and copies."""
 
 import copy
 from time import perf_counter
@@ -41,8 +41,6 @@ class PredictiveController(Published):
         Says of each step whether the model knows it; None without a monitor.
     """
 
-    _initial: InitialCondition
-
     def __init__(
         self,
         dt: float,
@@ -61,6 +59,11 @@ class PredictiveController(Published):
         self._estimator, self._watch = estimator, watch
         self._token: Token = [0]
         self._inside = 0
+
+    @property
+    def _initial(self) -> InitialCondition:
+        """Where the plan of a step starts."""
+        raise NotImplementedError
 
     @property
     def latency(self) -> int:

@@ -32,7 +32,7 @@ class Part:
     @classmethod
     def in_memory(cls, episodes: Episodes, place: str) -> "Part":
         """Return a part that is in memory."""
-        return cls(place, partial(getitem, (episodes,), 0))
+        return cls(place, partial(getitem, (episodes,), 0))  # processes can pickle it
 
     def map(self, change: EpisodesMap) -> "Part":
         """Return a part whose episodes go through `change` when it is loaded."""

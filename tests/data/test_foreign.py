@@ -4,6 +4,7 @@ import gc
 import json
 import sqlite3
 import struct
+import subprocess
 import sys
 
 import numpy as np
@@ -489,3 +490,22 @@ def test_formulas_of_clocks_and_inside_tables_are_refused_by_name(where, message
     write_formula(tmp_path / "log.mf4", "X*2", **{where: True})
     with pytest.raises(km.errors.LogError, match=message):
         km.load_episodes(tmp_path / "log.mf4", states=["theta"], inputs=["u"])
+
+
+def test_a_heap_on_which_the_hdf5_library_walks_for_ever_is_refused(tmp_path):
+    write_h5(tmp_path / "log.h5")
+    content = bytearray((tmp_path / "log.h5").read_bytes())
+    start = content.index(b"GCOL\x01")
+    place = start + 16
+    while number := int.from_bytes(content[place : place + 2], "little"):
+        place += 16 + -(-int.from_bytes(content[place + 8 : place + 16], "little") // 8) * 8
+    assert number == 0
+    content[place + 8 : place + 16] = bytes(8)  # free space of no length
+    (tmp_path / "log.h5").write_bytes(content)
+    code = (
+        "import sys, koopmpc as km\ntry:\n    km.load_episodes(sys.argv[1])\nexcept km.KoopmpcError as e:\n    print(e)"
+    )
+    done = subprocess.run(  # in a process of its own, which can be ended
+        [sys.executable, "-c", code, str(tmp_path / "log.h5")], capture_output=True, text=True, timeout=300, check=True
+    )
+    assert "log.h5 cannot be read as HDF5: a heap of texts is damaged; take another copy" in done.stdout

@@ -4,6 +4,7 @@ import gc
 import io
 import random
 import signal
+import struct
 import sys
 import warnings
 import zipfile
@@ -270,3 +271,17 @@ def test_nested_text_in_a_model_is_refused(tmp_path: Path, depth: int, kind: str
     rezipped(path, tree=member.getvalue())
     with pytest.raises(km.errors.LogError, match=r"model\.npz"):
         km.load_model(path)
+
+
+@pytest.mark.parametrize("before", [0, 1, 3])
+def test_free_space_of_no_length_at_the_very_end_of_a_heap_of_texts_is_refused(tmp_path: Path, before: int) -> None:
+    def make_heap(last: int) -> bytes:
+        words = b"".join(struct.pack("<HHIQ", 7, 1, 0, 5) + b"words\0\0\0" for _ in range(before))
+        content = words + struct.pack("<HHIQ", 0, 0, 0, last)
+        return b"GCOL\1\0\0\0" + struct.pack("<Q", 16 + len(content)) + content
+
+    for last in (0, 16):
+        (tmp_path / "heap.h5").write_bytes(b"\x89HDF" + make_heap(last) + bytes(40))
+        with pytest.raises(km.errors.LogError) as error:  # it is no whole HDF5 file, either
+            km.load_episodes(tmp_path / "heap.h5")
+        assert ("a heap of texts is damaged" in str(error.value)) == (last == 0)

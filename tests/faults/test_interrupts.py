@@ -241,3 +241,24 @@ def test_a_command_ends_at_once_with_one_line_and_whole_files(
             if path.suffix == ".rrd" and "bench" in arguments:
                 km.load_run(path)
     assert interrupted > 0
+
+
+def test_an_interrupt_in_the_last_iteration_of_a_solve_is_raised() -> None:
+    """OSQP takes the signal for itself, and its status says nothing of one that comes after its last look."""
+    from ctypes import CDLL
+
+    from osqp import ext_builtin
+
+    from koopmpc.control.solvers.osqp import _solve_uninterrupted
+
+    library = CDLL(ext_builtin.__file__)
+
+    def solve() -> None:
+        library.osqp_start_interrupt_listener()
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # as in another thread, which receives it
+        os.kill(os.getpid(), signal.SIGINT)
+        library.osqp_end_interrupt_listener()
+
+    with pytest.raises(KeyboardInterrupt):
+        _solve_uninterrupted(solve)
+    _solve_uninterrupted(lambda: (library.osqp_start_interrupt_listener(), library.osqp_end_interrupt_listener()))

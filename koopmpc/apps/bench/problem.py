@@ -224,7 +224,8 @@ class Problem:
                 f"{what}: reference has shape {size}, expected ({nr},) or (steps+1, nr) = ({case.steps + 1}, {nr}): "
                 f"the cost tracks {nr} outputs"
             )
-        _fits(case.limits or self.limits, self.dynamics, f"{what}: limits")
+        if case.limits is not None:
+            _fits(case.limits, self.dynamics, f"{what}: limits")
         _check_measured(case.measured, self.dynamics, (case.steps,), what)
         _check_plant(case.plant, self.dynamics.nw, what)
 

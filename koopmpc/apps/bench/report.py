@@ -329,8 +329,9 @@ def _draw_case(own: Sequence[RunRow], folder: Path, *, most: int = 12, starts: i
     cold = {name: np.array([row.cold_p50 for row in rows]) for name, rows in ended.items()}
     times = "Time of a step: median over runs, middle half, and 5 to 95 %; × with cold caches."
     yield render_svg(draw_step_times(hot, cold)), times
-    logs = {row.controller: folder / f"{row.name}.rrd" for row in usual if row.start == row.seed == 0}
-    runs = {name: load_run(log) for name, log in [*logs.items()][:most] if log.is_file()}
+    paths = [(row.controller, folder / f"{row.name}.rrd") for row in usual if row.start == row.seed == 0]
+    logs = [(name, path) for name, path in paths if path.is_file()]
+    runs = {name: load_run(path) for name, path in logs[:most]}
     many = {name: rows for name, rows in ended.items() if len(rows) >= starts}
     alone = ", without noise and with the plant as it is" * (len(usual) != len(own))
     if many and len(next(iter(many.values()))[0].x0) > 1:

@@ -152,9 +152,10 @@ def _list_runs(problems: Sequence[Problem], controllers: Sequence[str] | None, o
     if twice is not None:
         raise ProblemError(f"{twice} comes twice, and its logs would have one name; run it once, or rename a file")
     rows: list[RunRow] = []
+    parts = {problem.name: Prepared(problem) for problem in problems}
     for problem, case in ((each, case) for each in problems for case in each.cases):
         if any(options.wrong):
-            Prepared(problem).perturb_plant(case, 0.0, 0)  # raises where there is nothing to be wrong
+            parts[problem.name].perturb_plant(case, 0.0, 0)  # raises where there is nothing to be wrong
         names = asked if controllers else controller_names(problem.controllers)
         broken = (None, *(possible_faults(problem.limits_of(case)) if options.faults else ()))
         for fault, n, w, seed, name in product(broken, options.noise, options.wrong, range(options.seeds), names):

@@ -60,9 +60,9 @@ def audit_episodes(episodes: Episodes, *, cut: bool = True) -> Audited:
         sound = left.without(bad) if bad else None
         if sound is not None and sum(map(len, sound.data)) >= _LEAST * sum(map(len, episodes)):
             left, out = sound, kinds - mended
-    undecided = kinds if cut else {fault.name for fault in report.faults}
+    to_leave_out = kinds if cut else {fault.name for fault in report.faults}
     notes = [
-        f"{fault.name}: {_locate_fault(fault, episodes)}; {_say_repair(fault, mended, out, undecided)}"
+        f"{fault.name}: {_locate_fault(fault, episodes)}; {_say_repair(fault, mended, out, to_leave_out)}"
         for fault in report.faults
         if fault.repair is not Repair.COLUMN  # `find_repairs` says what it does
     ]
@@ -74,13 +74,13 @@ def audit_episodes(episodes: Episodes, *, cut: bool = True) -> Audited:
     return Audited(left.data, tuple(notes), report.delay, left.origins, doubtful)
 
 
-def _say_repair(fault: LogFault, mended: set[str], out: set[str], undecided: set[str]) -> str:
+def _say_repair(fault: LogFault, mended: set[str], out: set[str], to_leave_out: set[str]) -> str:
     """Return what is done about a fault whose kind was mended, left out, or should have been left out."""
     if fault.name in mended:
         return "these readings were replaced by the line between their neighbours"
     if fault.places and fault.name in out:
         return "these rows were left out"
-    if fault.places and fault.name not in undecided:
+    if fault.places and fault.name not in to_leave_out:
         return "these rows were kept: models without them forecast the other rows no better"
     if fault.steps:
         return f"models that see {fault.steps} steps of the past are tried: embedding=km.Delay({fault.steps})"

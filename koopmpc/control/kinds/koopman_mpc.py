@@ -146,7 +146,7 @@ class KoopmanMPC(PredictiveController):
         return self._step.program
 
     @property
-    def _initial(self) -> InitialCondition:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def _initial(self) -> InitialCondition:
         return self._step.initial
 
     @property

@@ -72,7 +72,7 @@ class StagedMPC(PredictiveController):
         return unpickler.load()
 
     @property
-    def _initial(self) -> InitialCondition:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def _initial(self) -> InitialCondition:
         return self._step.initial
 
     @property

@@ -65,6 +65,8 @@ def _checksums(about: str, size: int, first: int, *columns: np.ndarray) -> list[
 
 def _verify(table: Any, named: Mapping[str, Any], first: int = 0, rows: int | None = None) -> None:
     """Raise where rows of a file, the first of them number `first` of `rows`, are not those that were written."""
+    if _CHECK not in table.schema.metadata:
+        raise ValueError("its checksums are missing; take another copy")
     check = json.loads(table.schema.metadata[_CHECK])
     size, rows = int(check["rows"]), len(table) if rows is None else rows
     places = np.stack([table[name].to_numpy() for name in _PLACES], axis=1)

@@ -211,7 +211,7 @@ def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None, against: 
     faults = [] if times is None else list(find_clock_faults(data, times))
     log = Log(data)
     whole = Remainder.of(_unwrap_angles(data, values.find_whole_turns(log)))
-    for check in CHECKS.values():
+    for check in sorted(CHECKS.values(), key=lambda check: check.of_rest):
         if data.nu or not check.of_inputs:
             faults += _run_check(check, log, whole, faults)
     kinds, rest = {fault.name for fault in faults}, whole.without_faults(faults)

@@ -207,9 +207,9 @@ def choose_states(states: StateChoice | None, names: Sequence[str]) -> list[int]
 
 def find_plane(axes: Sequence[int | str], names: Sequence[str], what: str) -> tuple[int, int]:
     """Return the indices of the two states of a plane; raise if they are not two."""
-    checks.kind(axes, "axes", (tuple, list), "pass the two states of the plane, by index or name")
+    checks.kind(axes, what, (tuple, list), "pass its two states by index or name")
     if len(axes) != 2:
-        raise ShapeError(f"axes names {len(axes)} states; pass the two of the plane")
+        raise ShapeError(f"{what} has {len(axes)} states; pass two")
     i, j = (find_state(axis, names, what) for axis in axes)
     if i == j:
         raise DataError(f"both axes are {names[i]!r}; name two different states")

@@ -40,8 +40,9 @@ def load_run(path: str | Path) -> Run:
         steps = min(counts)
         if steps < 1:
             raise LogError(f"{log.path} holds no whole step; its run ended before the second state was written")
-        if not log.closed:
-            _warn_of_cut(log.path, steps, planned_steps)
+        ended = log.static(Entity.METRICS, "steps")  # a recording that a viewer saved may hold fewer rows
+        if not log.closed or ended not in (None, steps):
+            _warn_of_cut(log.path, steps, planned_steps if ended is None else ended)
         columns = sparse_columns(X, ms, len(about.outputs), len(about.inputs))
         return Run(
             X=X[: steps + 1],

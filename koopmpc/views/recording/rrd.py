@@ -155,10 +155,10 @@ class RerunLog:
         import rerun as rr
 
         self.style("checksum", rr.AnyValues(check=(_MARK + _BLANK + _GUARD).decode()))
-        self.rec.flush(timeout_sec=_FLUSH)
         if self._file is None:
+            self.rec.flush(timeout_sec=_FLUSH)
             return
-        rest = self._read_messages() if self.growing else self._stream.read()
+        rest = self._read_messages() if self.growing else self._stream.read()  # which flushes without a limit in time
         self._append(rest.replace(_MARK + _BLANK, _MARK + b"%08x" % checksum(rest, start=self._sum)))
         with self._explaining():
             disk.settle(self.part, self.path, self._file.fileno())
@@ -251,11 +251,13 @@ class LogColumns:
         cut = data[-12:-4] != _END and whole_messages < len(data)
         if check is not None and not cut:
             place = start + len(_MARK)
-            rest = memoryview(data)[place + len(_BLANK) :]
-            if checksum(memoryview(data)[:place], _BLANK, rest) != int(check.group(1), 16):
+            parts = memoryview(data)[:place], _BLANK, memoryview(data)[place + len(_BLANK) :]
+            if checksum(*parts) != int(check.group(1), 16):
                 raise LogError(f"{path} is damaged: it no longer holds what was written; take another copy")
         self._parts: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
-        with _copied(path, data[:whole_messages] if cut else b"") as whole:
+        copied = data[:whole_messages] if cut else b""
+        del data
+        with _copied(path, copied) as whole:
             try:
                 self._read(whole, entities)
             except (KeyboardInterrupt, SystemExit):

@@ -261,7 +261,7 @@ class Scenes:
         self._u: np.ndarray | None = None  # the last input
         self._ahead = False  # a plan was drawn before
         self._targets: dict[bytes, Float[np.ndarray, " nx"] | None] = {}  # states of the references
-        self._aims: dict[bytes, list[Shape]] = {}  # scenes of the references; most stay for many rows
+        self._aims: dict[bytes, list[Shape]] = {}  # scenes of the references of a block; most stay for many rows
 
     def draw_rows(self, first: int, rows: StepRows, plans: Sequence[tuple[int, np.ndarray, np.ndarray]]) -> Drawings:
         """Return the drawings of rows first, first + 1, … by entity; `plans` are steps with their planned X and U."""
@@ -271,6 +271,7 @@ class Scenes:
         ahead = {k: self._follow_plan(scene, k, X, U) for k, X, U in plans}
         now = [self._show(scene, first + i, rows, i) for i in range(len(rows.X))]
         moves = [rows.u_reference[min(i, len(rows.U) - 1)] for i in range(len(rows.X))] if len(rows.U) else []
+        self._aims.clear()
         aims = [self._aim(scene, *aim, first) for aim in zip(rows.reference, moves, strict=False)] or [[] for _ in now]
         drawings = draw_layer("world", self._names, _paint(now), 30.0, 1.0)
         self.extent.drawn.include([*now, *aims])

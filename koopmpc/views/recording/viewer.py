@@ -163,7 +163,11 @@ def serve(
         yield f"http://127.0.0.1:{port}?url=rerun%2Bhttp://127.0.0.1:{data}/proxy", data
     finally:
         server.terminate()
-        server.wait()
+        try:
+            server.wait(5.0)  # [s] a server that does not end is killed
+        except subprocess.TimeoutExpired:
+            server.kill()
+            server.wait()
 
 
 def _existing(logs: str | Path | Sequence[str | Path]) -> list[str]:

@@ -1,6 +1,8 @@
 # pyright: basic
 """HDF5 files (.h5, .hdf5): each dataset of numbers is a column, or a matrix of columns; read through h5py."""
 
+import mmap
+import struct
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -14,6 +16,7 @@ from koopmpc.base.errors import DataError, FitWarning, KoopmpcError, LogError
 from koopmpc.data.files.formats import LogFormat, LogTable, register_format
 
 EXTRA = "hdf5"
+_HEAP = b"GCOL\x01\0\0\0"  # begins a heap of texts
 _SAMPLE_TIMES = ("dt", "ts", "sample_time", "sampletime", "tsample")  # names of a scalar that is the sample time [s]
 _RATES = ("fs", "sample_rate", "samplerate", "sampling_rate", "sampling_frequency")  # of one that is 1/dt [Hz]
 _UNITS = ("units", "unit", "Units", "Unit")  # attributes of a dataset that state its unit
@@ -32,6 +35,7 @@ def load_datasets(file: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Return the numeric datasets of a file by their path, and their units."""
     import h5py
 
+    _require_sound_heaps(file)
     arrays, units = dict[str, np.ndarray](), dict[str, str]()
 
     def load(path: str, item: Any) -> None:
@@ -60,6 +64,30 @@ def load_datasets(file: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     except Exception as error:  # h5py raises what its C library reports: OSError, RuntimeError, KeyError, ValueError, …
         raise LogError(f"{file} cannot be read as HDF5: {error}; take another copy") from error
     return arrays, units
+
+
+def _require_sound_heaps(file: Path) -> None:
+    """Raise a LogError where a heap of texts has free space of no length, on which the HDF5 library walks for ever.
+
+    A heap is GCOL, version, three zeros and its size; then objects of number, count, zero, size and padded content. An
+    object of number 0 is free space, whose size includes these 16 bytes.
+    """
+    with file.open("rb") as stream:
+        if not stream.seek(0, 2):
+            return
+        with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as whole:
+            start = whole.find(_HEAP)
+            while start >= 0:
+                place = start + 16
+                end = (
+                    min(start + struct.unpack_from("<Q", whole, start + 8)[0], len(whole)) if place <= len(whole) else 0
+                )
+                while place + 16 <= end:
+                    number, _, _, size = struct.unpack_from("<HHIQ", whole, place)
+                    if number == 0 and size == 0:
+                        raise LogError(f"{file} cannot be read as HDF5: a heap of texts is damaged; take another copy")
+                    place += size if number == 0 else 16 + -(-size // 8) * 8
+                start = whole.find(_HEAP, start + 1)
 
 
 def _read_scalar(stream: Any, key: str) -> np.ndarray | None:

@@ -87,7 +87,11 @@ class MDFRecording(Recording):
                 group, index = self._places[name]
                 if group not in stretches:
                     time = partial(self._read_time, mdf, group)
-                    stretches[group] = [bisect_left(range(counts[name]), edge, key=time) for edge in (begin, end)]
+                    ends = {-np.inf: 0, np.inf: counts[name]}  # without a look into the file
+                    stretches[group] = [
+                        ends[edge] if edge in ends else bisect_left(range(counts[name]), edge, key=time)
+                        for edge in (begin, end)
+                    ]
                 first, last = stretches[group]
                 last = last if count is None else min(last, first + count)
                 formula = self._formulas.get((group, index), np.asarray)
