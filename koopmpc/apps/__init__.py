@@ -1,1 +1,1 @@
-"""What runs whole tasks: the papers that `koopmpc reproduce` reproduces."""
+"""Whole tasks: bench, fit and check, papers, and the command line."""

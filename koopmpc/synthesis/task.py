@@ -59,7 +59,7 @@ class DesignTask(Value):
         drawn from them. Three records or fewer have too few of them: rows all along the records stand beside them.
     steps
         Length of a run: three horizons, and as many steps as a linear loop on the data takes to settle from the
-        starts, at most 120; at least 120 where the reference moves; or all its steps.
+        starts, at most 120; at least 120 where the reference moves; or all steps of the reference.
     angles
         Indices of states whose errors wrap.
     low, high

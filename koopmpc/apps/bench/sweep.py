@@ -34,7 +34,7 @@ _NOT_ASKED = ("workers", "scheduler", "live", "paced", "log_starts")  # options 
 class _Grid(NamedTuple):
     """What is the same for all runs: how to find the problems, and where and how runs are written."""
 
-    name: str  # another one for each call of `sweep`, so that no worker takes another's controllers
+    name: str  # unique to each call of `sweep`: a worker never reuses the controllers of another
     problems: dict[str, "Problem | bytes | str"]
     folder: Path
     options: SweepOptions

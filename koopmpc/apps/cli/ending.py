@@ -53,7 +53,7 @@ class Ending:
                 os.write(2, f"interrupted; {clean_folder(self.folder)}\n".encode())
             clear_frames(trace)
             gc.collect()  # gives back the semaphores of worker processes, of which a tracker would warn
-            os._exit(INTERRUPTED)  # an interrupt inside `exec` has Python end the process by the signal itself
+            os._exit(INTERRUPTED)  # after an interrupt inside `exec` Python would end by the signal, and not with 130
 
 
 def clean_folder(folder: Path | None) -> str:

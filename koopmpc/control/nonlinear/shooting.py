@@ -47,11 +47,11 @@ class NLP:
     ----------
     solver
         "ipopt"; "fatrop", an interior point method that uses the stages; "sqpmethod", sequential quadratic programs
-        solved by qrqp. fatrop does not end where a model is no number, so that it takes only models that provably
-        are numbers everywhere: no root, logarithm or division that may fail.
+        solved by qrqp. fatrop may loop for ever where a model returns NaN: models with a root, a logarithm or a
+        division that may fail are refused.
     starts
         Solve the first step, and one after a failure, from this many guesses, rest at x_0 and random inputs, and
-        keep the best: several where the controller is the oracle, so that a local optimum is not the reference.
+        keep the best: several where other controllers are judged by this one, which must not be a local optimum.
     settings
         The solver's own settings by CasADi's names, for example ``{"ipopt.tol": 1e-10}``. It works on shares of the
         sizes of inputs, states, limits and cost (see `Sizes`): its tolerances count so.
@@ -85,7 +85,7 @@ _STATUS = {
     "SOLVER_RET_LIMITED": Status.MAX_ITERATIONS,
     "SOLVER_RET_INFEASIBLE": Status.INFEASIBLE,
 }
-# Names in the answers of solvers, kept: new ones at each step would fill Python's table of names, which is built again.
+# Keys of the answers of solvers, kept alive: else each step would add new ones to Python's table of names.
 _NAMES: set[str] = set()
 
 

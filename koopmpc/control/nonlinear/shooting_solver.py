@@ -22,7 +22,7 @@ from koopmpc.control.solvers.levels import LevelSearch, Relaxed
 from koopmpc.control.step.staged import PlanSolver, PlanStart, StagePlan
 
 Guess = tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]]  # states and inputs
-MOST = 5000  # beginnings of the same length, at most; beyond them nonlinear programs are searched
+MOST = 5000  # partial sequences of one length that are kept; where there are more, nonlinear programs are searched
 
 
 class ShootingSolver(PlanSolver):
@@ -76,7 +76,7 @@ class ShootingSolver(PlanSolver):
             if perf_counter() > deadline:
                 break
         good = [found for found in solved if found.status is Status.OPTIMAL]
-        if not good and perf_counter() < deadline:  # once more from where inputs at rest lead, which leaves no gaps
+        if not good and perf_counter() < deadline:  # once more from the roll-out of zero inputs, which has no gaps
             U = np.tile(np.clip(np.zeros_like(start.u_prev), *self._inputs), (len(start.e), 1))
             solved += [
                 self._shoot(start, begin, start.first) for begin in self._list_begins(self._roll_out(start, U), start)
