@@ -136,7 +136,8 @@ def test_a_controller_without_evidence_cannot_be_checked(tmp_path):
         check_controller(tmp_path / "c.npz", tmp_path)
 
 
-def test_a_check_of_what_is_no_controller_exits_with_2_and_says_what_to_pass(tmp_path, made):
+def test_a_check_of_what_is_no_controller_exits_with_2_and_says_what_to_pass(tmp_path, monkeypatch, made):
+    monkeypatch.chdir(tmp_path)
     cut, goal = tmp_path / "cut.npz", tmp_path / "goal.toml"
     cut.write_bytes(made.controller.read_bytes()[:-300])
     goal.write_text(GOAL)
