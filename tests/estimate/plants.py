@@ -2,7 +2,6 @@
 
 import numpy as np
 
-import koopmpc as km
 from tests import example_plants as plants
 
 
@@ -14,23 +13,6 @@ def linear(A, B, constant=None, E=None, dt=0.1):
 def stable(rng, nx, nu, radius=0.8):
     """A random (A, B) whose modes all die out."""
     return plants.random_pair(rng, nx, nu, radius)
-
-
-class Gate:
-    """The gate of readings of an observer whose model says y⁺ = u, so that it predicts what it is told."""
-
-    def __init__(self, n):
-        A = np.zeros((3 * n, 3 * n))
-        A[2 * n :, :n] = np.eye(n)
-        B = np.vstack([np.eye(n), np.eye(n), np.zeros((n, n))])
-        names = [f"y{i}" for i in range(n)], [f"u{i}" for i in range(n)]
-        model = km.LinearPredictor(A, B, np.eye(n, 3 * n), km.State(), 0.1, *names, embedding=km.Delay(1))
-        self.observer = km.KoopmanMPC(model, km.Cost(Q=1, R=1), None, 5).observer
-
-    def judge(self, y, predicted):
-        """Return whether y is refused."""
-        self.observer.observe(np.array(y, dtype=float), np.array(predicted, dtype=float), np.zeros(0))
-        return self.observer.refused
 
 
 class Textbook:

@@ -386,7 +386,7 @@ def test_units_of_a_given_model_do_not_decide_its_drift(disturbance):
 
 def test_a_model_that_is_not_lifted_and_a_filter_that_does_not_exist_are_refused(monkeypatch):
     plant = km.discretize(km.load_problem("pendulum").dynamics, 0.05)
-    with pytest.raises(km.errors.DataError, match=r"filters the lifted state of a"):
+    with pytest.raises(km.errors.DataError, match=r"filters the lifted state of a .*pass a LiftedDisturbance"):
         km.NonlinearMPC(plant, km.Cost(Q=[1, 1], R=1), horizon=5, estimator=km.LiftedKalman("theta"))
 
     def none(*arguments):

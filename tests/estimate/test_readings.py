@@ -4,14 +4,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import koopmpc as km
 from tests.compiler import avoid_compiling, needs_compiler
 from tests.control.test_random_bilinear_loops import PLANTS as OSCILLATORS
 from tests.estimate.pendulums import PROBLEM, truth
-from tests.estimate.plants import Gate, linear
+from tests.estimate.plants import linear
 from tests.tiers import few
 
 NOISE = 1e-3
@@ -268,38 +266,6 @@ def test_the_run_of_a_loop_holds_which_readings_were_refused():
     )
     assert np.flatnonzero(run.refused).tolist() == [20, 21, 22]
     assert run.refused.dtype == np.int64
-
-
-@given(st.integers(0, 10**6), st.lists(st.floats(-6, 6), min_size=2, max_size=2))
-def test_units_do_not_decide_what_is_refused(seed, powers):
-    rng, scale = np.random.default_rng(seed), 10.0 ** np.array(powers)
-    gate, scaled = Gate(2), Gate(2)
-    for _ in range(80):
-        predicted = rng.normal(size=2)
-        y = predicted + rng.normal(size=2) * rng.choice([0.1, 0.1, 0.1, 20.0])
-        assert gate.judge(y, predicted) == scaled.judge(scale * y, scale * predicted)
-
-
-def is_refused(readings, predictions, last):
-    """Whether a reading that is off by this much is refused behind these."""
-    gate = Gate(1)
-    for y, predicted in zip(readings, predictions, strict=True):
-        gate.judge([y], [predicted])
-    return gate.judge([predictions[-1] + last], [predictions[-1]])
-
-
-@pytest.mark.parametrize("spread", [1e-3, 1e-2])
-def test_the_bound_follows_the_spread_of_the_innovations(spread):
-    """At rest it is eight times the running deviation."""
-    readings = spread * np.random.default_rng(0).normal(size=400)
-    assert not is_refused(readings, np.zeros(400), 4 * spread)
-    assert is_refused(readings, np.zeros(400), 14 * spread)
-
-
-def test_the_bound_is_a_share_of_the_largest_step_where_predictions_are_exact():
-    step = np.arange(100) > 30
-    assert not is_refused(step, step * 1.0, 0.9 * 8 * 0.01)
-    assert is_refused(step, step * 1.0, 1.1 * 8 * 0.01)
 
 
 def test_a_missing_entry_is_neither_judged_nor_refused():

@@ -5,25 +5,9 @@ import pytest
 
 import koopmpc as km
 from tests.compiler import needs_compiler
-from tests.estimate.plants import Gate, linear
+from tests.estimate.plants import linear
 
 BIT = 2.0**-52
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_a_gate_refuses_what_it_would_refuse_of_predictions_that_differ_in_their_last_bit(seed):
-    """A model that is exact, an output that moves, one that rests away from zero, and at times a real misfit."""
-    rng, gates = np.random.default_rng(seed), [Gate(2) for _ in range(3)]
-    judged = []
-    for k in range(150):
-        y = np.array([np.sin(0.3 * k) + 1.5, 5.0])
-        misfit = rng.normal(size=2) * (rng.choice([0.0, 3.0, 50.0], p=[0.8, 0.15, 0.05]) if k > 2 else 0.0)
-        bits = BIT * rng.integers(-1, 2, 2)
-        judged.append(
-            [gate.judge(y + misfit, y * (1 + share * bits)) for gate, share in zip(gates, (0, 1, 3), strict=True)]
-        )
-    assert all(len(set(row)) == 1 for row in judged)
-    assert any(row[0] for row in judged)
 
 
 def test_what_is_learned_of_a_state_does_not_depend_on_the_rounding_of_one_that_rests():

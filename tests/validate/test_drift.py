@@ -6,6 +6,8 @@ from scipy.linalg import expm
 
 import koopmpc as km
 
+SIGMA = 0.005  # noise of the sensors as a share of the states' spread
+
 
 def sample(A, B, dt):
     n, m = B.shape
@@ -26,6 +28,15 @@ def log(A, B, episodes, steps, rng, sigma, *, amplitude=1.0, u0=0.0, load=0.0, g
             X.append(F @ X[-1] + G @ (gain * u) + load)
         made.append(km.Episode(X=np.array(X) * sensor + sigma * rng.standard_normal((len(X), len(A))), U=U))
     return km.Episodes(made, 0.1)
+
+
+def draw_plant(rng):
+    nx = int(rng.integers(1, 4))
+    nu = int(rng.integers(1, 3)) if nx > 1 else 1
+    A, B = rng.normal(size=(nx, nx)), rng.normal(size=(nx, nu))
+    A -= (np.linalg.eigvals(A).real.max() + 0.5) * np.eye(nx)
+    size = log(A, B, 1, 400, rng, 0.0)[0].X.std(axis=0)
+    return A, B, size
 
 
 SPRING = np.array([[0.0, 1.0], [-2.0, -0.6]]), np.array([[0.0], [1.5]])
@@ -109,3 +120,36 @@ def test_logs_of_other_signals_or_steps_are_refused(old):
         km.validate.find_drift(old, km.Episodes(list(old), 0.2))
     with pytest.raises(km.errors.DataError, match="too few rows"):
         km.validate.find_drift(km.Episodes([km.Episode(X=old[0].X[:9], U=old[0].U[:8])], 0.1), old)
+
+
+@pytest.mark.slow
+def test_of_400_unchanged_plants_none_is_named_and_of_100_changes_at_least_90():
+    rng, named, right, silent = np.random.default_rng(7), 0, 0, 0
+    for i in range(400):
+        A, B, size = draw_plant(rng)
+        sigma = SIGMA * size
+        old = log(A, B, 6, 150, rng, sigma)
+        load = rng.uniform(-0.05, 0.05, len(A)) * size * (i % 2)
+        new = log(A, B, 1, 500, rng, sigma, u0=rng.uniform(-0.3, 0.3) * (i % 3 > 0), load=load, amplitude=0.8)
+        named += km.validate.find_drift(old, new).verdict == "changed"
+        if i >= 100:
+            continue
+        share, kind, C = rng.choice([0.8, 1.2]), i % 3, A.copy()
+        gain, sensor = np.ones(B.shape[1]), np.ones(len(A))
+        if kind == 0:
+            j = int(rng.integers(B.shape[1]))
+            gain[j], name = share, f"the gain of u{j}"
+        elif kind == 1:
+            j = int(rng.integers(len(A)))
+            sensor[j], name = share, f"the sensor of x{j}"
+        else:
+            a, b = np.unravel_index(int(np.argmax(np.abs(A))), A.shape)
+            C[a, b] *= share
+            name = f"the coefficient of x{b} in the change of x{a}"
+        report = km.validate.find_drift(old, log(C, B, 1, 500, rng, sigma, gain=gain, sensor=sensor, load=load))
+        right += name in {one.name for one in report.changes}
+        quiet = log(A, B, 1, 300, rng, sigma, amplitude=0.005)
+        silent += km.validate.find_drift(old, quiet).verdict == "cannot say"
+    assert named == 0
+    assert right >= 90
+    assert silent >= 99
