@@ -129,4 +129,3 @@ DESIGNED: dict[str, Callable[[Parts], Any]] = {
 }
 YARDSTICKS = ("edmd", "dmdc")
 GIVEN = ("lqr", "linear-mpc", "nonlinear-mpc", "bilinear-exact")  # on equations: one seed is as good as three
-LEARNED = ("koopman-mpc", "koopman-offset", "bilinear-mpc", "bilinear-offset")  # from data alone

@@ -160,18 +160,6 @@ def promised(expected: km.synthesis.ExpectedLoop, costs: Sequence[float], violat
     }
 
 
-def kept_promises(rows: Iterable[Row]) -> dict[str, float]:
-    """Return which shares of the runs kept the promises: cost inside the interval, violation below its bound."""
-    kept = [row.promise for row in rows if row.promise]
-    if not kept:
-        return {}
-    return {
-        "cost": float(np.mean([one["low"] <= one["cost"] <= one["high"] for one in kept])),
-        "violation": float(np.mean([one["violation"] <= one["most"] for one in kept])),
-        "mean bound": float(np.mean([one["most"] for one in kept])),
-    }
-
-
 def _ends(X: np.ndarray, best: np.ndarray, last: int) -> tuple[np.ndarray, np.ndarray]:
     """Return both trajectories, the first one's last state repeated where the run was ended."""
     return np.vstack([X, np.repeat(X[-1:], max(last - len(X), 0), axis=0)]), best

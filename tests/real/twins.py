@@ -257,10 +257,6 @@ def _pi() -> Callable[[float, float], float]:
     return act
 
 
-def _mechanics(rhs: Map) -> Map:
-    return lambda x, u, p: x[0]
-
-
 def _strokes(rng: np.random.Generator, rows: int) -> np.ndarray:
     """Return set points of a drive [mm]: strokes between random places, smooth at both ends."""
     places = np.concatenate([[0.0], rng.uniform(0, 240, rows // 900 + 2)])
