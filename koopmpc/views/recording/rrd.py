@@ -14,7 +14,7 @@ from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -96,7 +96,7 @@ class RerunLog:
                 self.part = self.path.with_name(f"{self.path.name}{disk.PART}") if self.path.exists() else self.path
             self._file = self.part.open("wb", buffering=0)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "RerunLog":
         return self
 
     def __exit__(

@@ -382,6 +382,7 @@ def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Pre
     """
     checks.kind(run, "run", Run, "pass what simulate returned; a model is written by km.recording.record_model")
     scene, model = scene or run.scene, run.model if model is None else model
-    with Writer(About(**run.about()), path=path_of(path), scene=scene, model=model, steps=run.steps) as writer:
+    writer = Writer(About(**run.about()), path=path_of(path), scene=scene, model=model, steps=run.steps)
+    with writer:
         writer.write(LogBlock(**run.columns(), plans=run.plans))
         writer.end(run)
