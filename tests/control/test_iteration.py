@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.control.ask.limits import SOFTENED
 from koopmpc.control.nonlinear import iteration
 from koopmpc.control.nonlinear.condensed_stages import StageStep
 from koopmpc.control.nonlinear.iteration import RealTimeIteration
 from koopmpc.control.nonlinear.stages import StagedProblem, StageTargets
-from koopmpc.control.nonlinear.stagewise import linearisation
-from tests.control.test_stagewise import PROBLEMS, flat
+from koopmpc.control.nonlinear.stagewise import linearisation, list_sides, plan_cost, simulation
+from tests.control.test_stagewise import PROBLEMS, R_DELTA, Q, R, each_kind, flat, problem_of
 
 
 def slope(function, at: np.ndarray) -> np.ndarray:
@@ -37,6 +38,122 @@ class Plan:
 
     def F(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         return flat(self.problem.F(x, u, np.zeros(0)))
+
+    def of(self, x: np.ndarray) -> np.ndarray:
+        return flat(self.problem.tracked(x))
+
+    def g(self, x: np.ndarray) -> np.ndarray:
+        return flat(self.problem.limited(x))
+
+    def missed(self, k: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what is weighed of x_{k+1}, and the weight."""
+        return self.aimed(k, x), np.eye(len(self.m)) if k == self.N - 1 else self.problem.Q
+
+    def aimed(self, k: int, x: np.ndarray) -> np.ndarray:
+        return self.M @ self.of(x) + self.L @ x - self.m if k == self.N - 1 else self.of(x) - self.R[k]
+
+
+@each_kind
+def test_a_linearisation_holds_the_jacobians_of_each_stage_and_its_gauss_newton_terms(kind):
+    plan, problem = Plan(PROBLEMS[kind], 0), PROBLEMS[kind]
+    found = linearisation(problem)(plan.X.T, plan.U.T, *plan.targets, np.zeros(0))
+    nx, ng = problem.nx, len(problem.box.low)
+    A, B, F, H, q, r, g, G = (
+        value.full().T.reshape(plan.N, columns, -1).transpose(0, 2, 1)
+        for value, columns in zip(found, (nx, 2, 1, nx, 1, 1, 1, nx), strict=True)
+    )
+    for k in range(plan.N):
+        x, u, x_next = plan.X[k], plan.U[k], plan.X[k + 1]
+        np.testing.assert_allclose(A[k], slope(partial(plan.F, u=u), x), atol=1e-8)
+        np.testing.assert_allclose(B[k], slope(partial(plan.F, x), u) * problem.free[k], atol=1e-8)
+        np.testing.assert_allclose(F[k].ravel(), plan.F(x, u), atol=1e-12)
+        missed, weight = plan.missed(k, x_next)
+        J = slope(partial(plan.aimed, k), x_next)
+        np.testing.assert_allclose(H[k], J.T @ weight @ J, atol=1e-7)
+        np.testing.assert_allclose(q[k].ravel(), J.T @ weight @ missed, atol=1e-7)
+        np.testing.assert_allclose(r[k].ravel(), problem.R @ (u - plan.U_r[k]), atol=1e-12)
+        if ng:
+            np.testing.assert_allclose(g[k].ravel(), plan.g(x_next), atol=1e-12)
+            np.testing.assert_allclose(G[k], slope(plan.g, x_next), atol=1e-8)
+
+
+@each_kind
+def test_a_plan_costs_the_sum_of_its_stages_and_what_breaks_soft_limits(kind):
+    problem = PROBLEMS[kind]
+    for seed in range(5):
+        plan, total = Plan(problem, seed), 0.0
+        for k in range(plan.N):
+            missed, weight = plan.missed(k, plan.X[k + 1])
+            moved, g = plan.U[k] - plan.U_r[k], plan.g(plan.X[k + 1])
+            total += missed @ weight @ missed + moved @ problem.R @ moved
+            for i, (low, high) in enumerate(zip(*problem.box, strict=True)):
+                into = i - len(g) + problem.margin.shape[1]
+                margin = problem.margin[k, into] if into >= 0 else 0.0
+                over = max(low + margin - g[i], g[i] - (high - margin), 0.0)
+                if np.isfinite(problem.softness.linear[i]):
+                    total += problem.softness.linear[i] * over + problem.softness.quadratic[i] * over**2
+        ends = (end.T for end in problem.stage_limits)
+        said = plan_cost(problem)(plan.X.T, plan.U.T, *plan.targets, *ends)
+        assert float(said) == pytest.approx(total, rel=1e-12)
+
+
+@each_kind
+def test_a_simulation_is_a_step_from_each_stage(kind):
+    plan = Plan(PROBLEMS[kind], 0)
+    found = simulation(plan.problem)(plan.X[:-1].T, plan.U.T, np.zeros(0)).full().T
+    steps = [plan.F(x, u) for x, u in zip(plan.X[:-1], plan.U, strict=True)]
+    np.testing.assert_allclose(found, steps, atol=1e-12)
+
+
+def test_stages_with_rates_hold_the_last_input_and_soft_changes_and_are_weighed_and_limited_so():
+    plain, rated, rng = problem_of("plain"), PROBLEMS["rated"], np.random.default_rng(0)
+    x, last, v = rng.standard_normal(2), rng.standard_normal(2), rng.standard_normal(2)
+    s = np.concatenate([x, last, [0.7]])
+    assert rated.nx == len(s)
+    assert rated.soft_rates.tolist() == [1]
+    u = last + v
+    after = np.concatenate([flat(plain.F(x, u, np.zeros(0))), u, v[1:]])
+    np.testing.assert_allclose(flat(rated.F(s, v, np.zeros(0))), after, atol=1e-12)
+    np.testing.assert_allclose(flat(rated.tracked(s)), [np.sin(x[0]), np.cos(x[0]), x[1], *last], atol=1e-12)
+    np.testing.assert_allclose(flat(rated.limited(s)), [*last, 0.7, *x, np.sin(x[0])], atol=1e-12)
+    np.testing.assert_array_equal(rated.Q[:3, :3], Q)
+    np.testing.assert_array_equal(rated.Q[3:, 3:], R)
+    assert not rated.Q[:3, 3:].any()
+    np.testing.assert_array_equal(rated.R, R_DELTA)
+    np.testing.assert_array_equal(rated.inputs.high, [0.3, np.inf])
+    np.testing.assert_array_equal(rated.inputs.low, [-0.3, -np.inf])
+    np.testing.assert_array_equal(rated.box.low, [-1, -2, -0.4, -np.inf, -0.6, -0.95])
+    np.testing.assert_array_equal(rated.box.high, [1.5, np.inf, 0.4, 1.2, 0.8, 0.9])
+    np.testing.assert_array_equal(rated.softness.linear, [np.inf, np.inf, 2, 5, np.inf, 7])
+    np.testing.assert_array_equal(rated.softness.quadratic, [0, 0, 3, 2, 0, 0])
+    np.testing.assert_array_equal(rated.margin, [[0.01, 0.02, 0]] + 3 * [[0.03, 0.04, 0]])
+    assert rated.free.tolist() == [True, True, False, True]
+    assert rated.held_from.tolist() == [[0, 0], [1, 1], [1, 1], [3, 3]]
+    assert rated.input_sizes[0] == 1.25  # half the width of its limits
+    np.testing.assert_array_equal(rated.sizes, [*plain.sizes, *rated.input_sizes, rated.input_sizes[1]])
+    np.testing.assert_allclose(rated.softness.allowance[:2], SOFTENED * rated.input_sizes)
+
+
+@each_kind
+def test_the_sides_are_the_finite_ends_and_cost_half_of_what_the_limits_cost(kind):
+    problem = PROBLEMS[kind]
+    found = list_sides(problem)
+    low, high = (np.concatenate([problem.inputs[i], problem.box[i]]) for i in (0, 1))
+    linear, quadratic = (np.concatenate([np.full(2, first), problem.softness[i]]) for i, first in ((0, np.inf), (1, 0)))
+    size = np.concatenate([problem.input_sizes, problem.softness.allowance / SOFTENED])
+    ends = {(i, 1.0) for i in np.flatnonzero(np.isfinite(low))} | {(i, -1.0) for i in np.flatnonzero(np.isfinite(high))}
+    assert set(zip(found.row.tolist(), found.sign.tolist(), strict=True)) == ends
+    assert len(found.row) == len(ends)
+    soft = np.isfinite(linear[found.row])
+    assert found.soft == np.count_nonzero(soft)
+    assert (np.sort(soft) == soft).all()  # the hard ones come first
+    for i, span in zip(found.row, found.span, strict=True):
+        assert span == (high[i] - low[i] if np.isfinite(high[i] - low[i]) else 2 * size[i])
+    over = 0.37
+    for i, price, growth, span in zip(found.row[soft], found.linear, found.quadratic, found.span[soft], strict=True):
+        eps = over / span
+        half = 0.5 * (linear[i] * over + quadratic[i] * over**2)
+        assert price * eps + 0.5 * growth * eps**2 == pytest.approx(half)
 
 
 with pytest.MonkeyPatch.context() as no_compiler:

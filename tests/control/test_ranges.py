@@ -1,10 +1,13 @@
-"""fatrop takes models that are numbers everywhere, and refuses others by what may be none."""
+"""Whether a model is a number everywhere: what is accepted never meets a NaN, and fatrop takes nothing else."""
 
 import casadi as ca
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import koopmpc as km
+from koopmpc.control.nonlinear.ranges import find_undefined_operation
 
 NAMED = {
     "pendulum": lambda x: ca.sin(x[0]) / (1 + 0.2 * ca.sin(x[0]) ** 2),
@@ -33,8 +36,23 @@ def plan_with_fatrop(of):
     return km.NonlinearMPC(plant, cost, km.Limits(-1, 1), 2, solver="fatrop")
 
 
+def function(of) -> ca.Function:
+    x = ca.SX.sym("x", 2)
+    return ca.Function("f", [x], [of(x)])
+
+
+def with_slopes(f: ca.Function, at) -> np.ndarray:
+    """Return the value, its gradient and its curvature."""
+    x = ca.SX.sym("x", 2)
+    H, g = ca.hessian(f(x), x)
+    return np.array(ca.Function("all", [x], [ca.vertcat(f(x), g, ca.vec(ca.densify(H)))])(at)).ravel()
+
+
 @pytest.mark.parametrize("name", NAMED)
-def test_what_is_a_number_everywhere_is_accepted(name):
+def test_what_is_a_number_everywhere_is_accepted_and_is_one(name):
+    rng, f = np.random.default_rng(0), function(NAMED[name])
+    for at in [np.zeros(2), np.ones(2), -np.ones(2), *rng.normal(0, 30, (50, 2))]:
+        assert np.isfinite(with_slopes(f, at)).all()
     assert np.isfinite(plan_with_fatrop(NAMED[name])([0.3, -0.2], [0.0]).u).all()
 
 
@@ -43,6 +61,41 @@ def test_an_observable_that_may_be_no_number_is_refused_by_its_name(name):
     of, word = REFUSED[name]
     with pytest.raises(km.errors.DataError, match=word):
         plan_with_fatrop(of)
+
+
+LEAVES = st.one_of(st.sampled_from(["x", "y"]), st.floats(-3, 3).map(lambda v: round(v, 2)))
+ALONE = {
+    "sin": ca.sin,
+    "exp": ca.exp,
+    "sqrt": ca.sqrt,
+    "log": ca.log,
+    "tanh": ca.tanh,
+    "sq": lambda e: e * e,
+    "abs": ca.fabs,
+}
+PAIRS = {"+": lambda a, b: a + b, "-": lambda a, b: a - b, "*": lambda a, b: a * b, "/": lambda a, b: a / b}
+TREES = st.recursive(
+    LEAVES,
+    lambda inner: st.one_of(
+        st.tuples(st.sampled_from(list(ALONE)), inner), st.tuples(st.sampled_from(list(PAIRS)), inner, inner)
+    ),
+    max_leaves=8,
+)
+
+
+def grown(tree, x):
+    if isinstance(tree, tuple):
+        name, *parts = tree
+        return (ALONE | PAIRS)[name](*(grown(part, x) for part in parts))
+    return {"x": x[0], "y": x[1]}.get(tree, ca.SX(tree) if not isinstance(tree, str) else None)
+
+
+@given(TREES, st.lists(st.floats(-20, 20), min_size=2, max_size=2))
+def test_no_accepted_expression_meets_what_is_no_number(tree, at):
+    f = function(lambda x: grown(tree, x) + 0 * x[0])
+    if find_undefined_operation(f) is None:
+        values = with_slopes(f, at)
+        assert np.isfinite(values).all() or np.abs(values[np.isfinite(values)]).max(initial=0) > 1e100  # an overflow
 
 
 class Outflow(km.Dynamics):

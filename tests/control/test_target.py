@@ -1,9 +1,10 @@
 import cvxpy as cp
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from koopmpc.control.ask.limits import Interval
+from koopmpc.control.step.aim import extend_rows
 from koopmpc.control.target import targets
 from tests.control.models import equilibrium
 
@@ -149,3 +150,35 @@ def test_of_all_equilibria_as_near_the_one_that_costs_least_is_taken(seed, nz):
     exact = np.linalg.lstsq(K, np.concatenate([np.zeros(nz + nu), -e, r]), rcond=None)[0]
     np.testing.assert_allclose(u, exact[nz : nz + nu], atol=1e-6 * (1 + np.abs(u).max()))
     np.testing.assert_allclose(C @ z, r, atol=1e-7 * (1 + np.abs(z).max()))
+
+
+@given(
+    period=st.floats(5, 200),
+    phase=st.floats(0, 6),
+    slope=st.floats(-2, 2),
+    offset=st.floats(-50, 50),
+    size=st.floats(0.1, 9),
+)
+@settings(max_examples=60, deadline=None)
+def test_sines_and_ramps_go_on(period, phase, slope, offset, size):
+    k = np.arange(70)
+    sine, ramp = size * np.sin(2 * np.pi * k / period + phase) + offset, slope * k + offset
+    rows = np.column_stack([sine, ramp, np.full(70, offset)])
+    for columns in (rows[:, ::2], rows[:, 1:]):
+        course = extend_rows(columns[:20], 3)
+        if np.ptp(columns[:20], axis=0).max() > 1e-3:
+            seen = 19 if course.drifts else 50  # a ramp goes on for a horizon, and rests then
+            np.testing.assert_allclose(
+                course.rows[:seen], columns[20 : 20 + seen], atol=2e-4 * (1 + np.abs(rows).max())
+            )
+            assert (course.rows[seen:] == course.rows[seen - 1]).all() or not course.drifts
+
+
+def test_rows_that_rest_or_obey_no_recurrence_do_not_go_on():
+    rng = np.random.default_rng(0)
+    step = np.repeat([0.0, 1.0], [9, 6])
+    for column in (np.ones(15), step, rng.uniform(size=15), 1.2 ** np.arange(15)):
+        assert extend_rows(column[:, None]).rows.shape == (0, 1)
+    assert extend_rows(np.column_stack([np.sin(np.arange(15)), rng.uniform(size=15)])).rows.shape == (0, 2)
+    assert extend_rows(np.arange(5.0)[:, None]).rows.shape == (0, 1)  # too few rows to tell
+    assert extend_rows(np.round(np.sin(np.arange(15) / 9), 3)[:, None]).rows.shape == (0, 1)  # and rounded ones

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.terminal_cost import stop_growing_modes
+from koopmpc.control.riccati import Recursion, RecursionStep, stationary
+from koopmpc.control.terminal_cost import believed_steps, stop_growing_modes, tail_stage
 from tests.bare import shown
 from tests.control.models import Told, linear, random_pair, step_map
 
@@ -470,3 +471,44 @@ def test_a_horizon_of_three_steps_does_not_shorten_the_tail_of_an_unstable_plant
     cost = km.Cost(Q=1, R=10)
     mpc, lqr = km.KoopmanMPC(model, cost, km.Limits(), 3), km.LQR(model, cost)
     assert mpc([0.1], [0.0]).u == pytest.approx(lqr([0.1], [0.0]).u, rel=1e-2)
+
+
+class WrittenLaws(Recursion):
+    """The law u = −K z of each length as it is written down, and the lengths that are asked for."""
+
+    def __init__(self, laws):
+        self.laws, self.asked = iter(np.array(laws)), []
+
+    def find_step(self, n):
+        self.asked.append(n - 10)
+        return RecursionStep(next(self.laws).T, np.eye(1), 1.0)
+
+
+def tried(model, laws, most=18):
+    """Return the tail behind 10 steps that is taken where each length has its own law, and the lengths."""
+    nx, nz = model.C.shape
+    stage = tail_stage(model.A, model.B, np.zeros((nz, 0)), model.C, np.eye(nx), 0.01 * np.eye(1), None)
+    written = WrittenLaws(laws)
+    return believed_steps(written, stage, model, 10, most, np.eye(nz)), written.asked
+
+
+def test_the_shortest_tail_that_is_good_on_the_model_is_taken():
+    """Laws before the good ones push the wrong way; one that costs a few thousandths more than the best is good too."""
+    model, _ = learned(0, 1e-3, km.State() + km.Constant())
+    stage = tail_stage(model.A, model.B, np.zeros((3, 0)), model.C, np.eye(2), 0.01 * np.eye(1), None)
+    good, lengths = stationary(stage, 1000).K.T, [0, 4, 9, 10, 18]
+    for best in range(1, 5):
+        assert tried(model, [-good] * best + [good] * (5 - best)) == (lengths[best], lengths)
+    assert tried(model, [1.05 * good] + [good] * 4)[0] == 0
+    assert tried(model, [2.0 * good] + [good] * 4)[0] == 4
+
+
+@pytest.mark.parametrize(("noise", "taken"), [(0.0, 0), (1e-3, 4)])
+def test_a_law_that_suffers_from_late_inputs_is_good_on_a_model_without_errors_alone(noise, taken):
+    """x⁺ = x + u under u = −1.2 x comes to rest sooner than under −0.6 x, but not where half of u comes a step late."""
+    rng = np.random.default_rng(0)
+    U = rng.uniform(-1, 1, (30, 5, 1))
+    X = np.concatenate([np.zeros((30, 1, 1)), np.cumsum(U, axis=1)], axis=1) + rng.uniform(-1, 1, (30, 1, 1))
+    X += noise * rng.normal(size=X.shape)
+    model = km.edmd(km.Episodes([km.Episode(X=x, U=u) for x, u in zip(X, U, strict=True)], 0.1), km.State())
+    assert tried(model, [[[1.2]]] + 4 * [[[0.6]]])[0] == taken

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.control.ask.terminal import measure_reach
 from tests.guarantees.test_terminal_set import draw_model, make_cart
 
 ROWS = 30
@@ -119,3 +120,22 @@ def test_an_ellipsoid_needs_a_cost_to_go_that_grows_in_every_direction():
     limits = km.Limits(u_min=-1, u_max=1, du_max=0.5)
     with pytest.raises(km.errors.DataError, match="weigh every state, and every input whose rate is limited"):
         km.guarantees.find_terminal_set(make_cart(), km.Cost(Q=1, R=0), limits, [0.0, 0.0], kind="ellipsoid")
+
+
+@pytest.mark.parametrize("kind", ["polytope", "ellipsoid"])
+def test_the_reach_of_a_set_is_that_of_its_points(kind):
+    model, rng = make_cart(), np.random.default_rng(0)
+    cost, limits = km.Cost(Q=1, R=0.1), km.Limits(u_min=-1, u_max=1, x_max=[2, 0.5], x_min=-3, du_max=0.8)
+    end = km.guarantees.find_terminal_set(model, cost, limits, [0.3, 0.0], kind=kind)
+    G = rng.normal(size=(3, 2))
+    reach = measure_reach(end, np.eye(2), G, None)
+    spread = np.linalg.norm(np.linalg.pinv(end.rows), axis=0).sum()
+    ways = rng.normal(size=(40_000, 3)) * spread
+    points = end.center + ways / np.maximum(end.measure(end.center + ways), 1e-9)[:, None]  # on the edge
+    values = points[:, :2] @ G.T
+    inputs = end.feedback.u + (points - end.center) @ end.feedback.K.T
+    for seen, bound in ((values, reach.outputs), (inputs, reach.inputs), (inputs - points[:, 2:], reach.rates)):
+        width = bound.high - bound.low
+        assert (seen <= bound.high + 1e-9).all()
+        assert (seen >= bound.low - 1e-9).all()
+        assert (seen.max(axis=0) >= bound.high - 0.05 * width).all()
