@@ -119,3 +119,20 @@ def test_with_latency_changes_count_from_the_input_that_was_computed_last():
         x, acting, before = INTEGRATOR.A @ x + INTEGRATOR.B @ acting, before, move.u
     assert np.abs(changes).max() < 0.2 + 1e-6
     assert changes[0] == pytest.approx(-0.2, abs=1e-4)  # the rates are active
+
+
+@pytest.mark.parametrize("kind", [km.KoopmanMPC, km.BilinearMPC])
+def test_a_refused_disturbance_leaves_the_inputs_that_are_on_their_way(kind):
+    """The call that raised counts as none: later inputs are those of a controller that was never asked it."""
+    A, B, E = INTEGRATOR.A, INTEGRATOR.B, np.array([[0.0], [0.1]])
+    model = linear(A, B, E=E)
+    asked, unasked = (kind(model, km.Cost([1.0, 0.1], 0.1), km.Limits(-1, 1), 10, latency=2) for _ in range(2))
+    x, sent = np.array([1.0, 0.0]), [np.zeros(1)] * 2
+    for k in range(8):
+        if k in (2, 3):
+            with pytest.raises(km.errors.ShapeError, match="w has shape"):
+                asked(x, [0.0, 0.0], w=[0.1, 0.2, 0.3])
+        move = asked(x, [0.0, 0.0], w=[0.1])
+        assert np.array_equal(move.u, unasked(x, [0.0, 0.0], w=[0.1]).u)
+        sent.append(move.u)
+        x = A @ x + B @ sent.pop(0) + E @ [0.1]

@@ -23,8 +23,8 @@ from koopmpc.control.nonlinear.task import StagedTask, describe_stage_bounds
 from koopmpc.control.plan.task import Moves
 from koopmpc.control.program import no_export, reference_table, refuse_time_limit, trace_lifting
 from koopmpc.control.solvers.daqp import daqp_settings
+from koopmpc.control.solvers.levels import LevelSearch
 from koopmpc.control.step.aim import BEYOND
-from koopmpc.control.step.staged import StagedStep
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.disturbance import LiftedDisturbance
@@ -126,9 +126,9 @@ class BilinearMPC(StagedMPC):
         self._sqp_iterations = checks.count(sqp_iterations, "sqp_iterations")
         super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
 
-    def _make_solver(self, task: StagedTask, step: StagedStep) -> RealTimeSolver:
+    def _make_solver(self, task: StagedTask, levels: LevelSearch | None) -> RealTimeSolver:
         self._iteration = RealTimeIteration(task.problem, compiles_model=self._compiles_model)
-        return RealTimeSolver(self._iteration, task, self._sqp_iterations, step.levels)
+        return RealTimeSolver(self._iteration, task, self._sqp_iterations, levels)
 
     def _made_of(self) -> tuple[str, ModelOrMap, dict[str, Any]]:
         return "BilinearMPC", self.model, {"sqp_iterations": self._sqp_iterations}

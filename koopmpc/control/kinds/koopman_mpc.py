@@ -231,10 +231,17 @@ class KoopmanMPC(PredictiveController):
             Limits of this step in place of the controller's own, best made by their `with_bounds`: bounds that hold,
             or rows of which row 0 is that of this step. Only bounds move: a limit must be finite in the controller's
             own limits, or declared in their `rows`, whose sizes and slack weights hold.
+
+        Raises
+        ------
+        DataError
+            Limits that cross in some step, or that the controller has no row for.
+        ShapeError
+            A size that does not fit; limits with fewer rows than the plan reads.
         """
         start = perf_counter()
         called = None if limits is None else self._read_calls().read(limits)
-        move = self._step(y, reference, applied, w, called)
+        move = self._step(y, reference, applied, w, called, start=start)
         return move if self._watch is None else self._judge_step(self._watch, move, applied, start)
 
     def _read_calls(self) -> CallBounds:

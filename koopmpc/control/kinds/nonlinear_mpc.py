@@ -16,7 +16,7 @@ from koopmpc.control.nonlinear.stages import ModelOrMap
 from koopmpc.control.nonlinear.task import StagedTask
 from koopmpc.control.plan.task import Moves
 from koopmpc.control.program import Program, SavedController, no_export
-from koopmpc.control.step.staged import StagedStep
+from koopmpc.control.solvers.levels import LevelSearch
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator
@@ -100,10 +100,10 @@ class NonlinearMPC(StagedMPC):
         self._nlp = solver if isinstance(solver, NLP) else NLP(solver)
         super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
 
-    def _make_solver(self, task: StagedTask, step: StagedStep) -> ShootingSolver:
-        fixes = {} if step.levels is None else {"inputs_check": False}  # it warns of nodes that fix all inputs
+    def _make_solver(self, task: StagedTask, levels: LevelSearch | None) -> ShootingSolver:
+        fixes = {} if levels is None else {"inputs_check": False}  # it warns of nodes that fix all inputs
         nlp = replace(self._nlp, settings={**fixes, **self._nlp.settings})
-        return ShootingSolver(task, nlp, step.levels)
+        return ShootingSolver(task, nlp, levels)
 
     def _made_of(self) -> tuple[str, ModelOrMap, dict[str, Any]]:
         return "NonlinearMPC", self.model, {field.name: getattr(self._nlp, field.name) for field in fields(NLP)}

@@ -3,7 +3,6 @@
 import copy
 import io
 import pickle
-from abc import abstractmethod
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -18,6 +17,7 @@ from koopmpc.control.move import Move, Plan, alone
 from koopmpc.control.nonlinear.stages import ModelOrMap
 from koopmpc.control.nonlinear.task import StagedTask, read_staged_task
 from koopmpc.control.plan.task import Moves
+from koopmpc.control.solvers.levels import LevelSearch
 from koopmpc.control.step.observe import InitialCondition
 from koopmpc.control.step.staged import PlanSolver, StagedStep
 from koopmpc.control.watching import StepMonitor, find_monitor
@@ -47,13 +47,12 @@ class StagedMPC(PredictiveController):
         observer = start_observer(estimator, task.map, task.N)
         watch = None if monitor is None else find_monitor(monitor, model).watch(task.map, task.latency)
         super().__init__(model.dt, task.outputs, task.moves, latency, estimator, time_limit, watch)
-        self._task, self._step = task, StagedStep(task, observer)
-        self._step.solver = self._make_solver(task, self._step)
+        self._task, self._step = task, StagedStep(task, observer, self._make_solver)
         self._step.reset(None, None)
 
-    @abstractmethod
-    def _make_solver(self, task: StagedTask, step: StagedStep) -> PlanSolver:
+    def _make_solver(self, task: StagedTask, levels: LevelSearch | None) -> PlanSolver:
         """Return what finds the plans of a step."""
+        raise NotImplementedError
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "StagedMPC":
         """Return a copy with solvers of its own: CasADi's copies share one, and two threads in one end the process.
@@ -140,7 +139,7 @@ class StagedMPC(PredictiveController):
         """Return the first input of the plan for state y; arguments as for KoopmanMPC."""
         start = perf_counter()
         called = None if limits is None else self._step.bounds.at_call(limits)
-        move = self._step(y, reference, applied, w, called)
+        move = self._step(y, reference, applied, w, called, start=start)
         return move if self._watch is None else self._judge_step(self._watch, move, applied, start)
 
     def read_limits(self, limits: Limits) -> Limits:

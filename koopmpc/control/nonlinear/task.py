@@ -37,10 +37,6 @@ class StagedTask:
         The blocks of held inputs, and steps until an input acts.
     estimator, time_limit
         The rule that finds d, and the wall-clock time of a step [s]; None without.
-    disturbed
-        Whether disturbances, measured or estimated, move the target.
-    N
-        Steps of the plan.
     """
 
     map: LearnedMap
@@ -50,8 +46,16 @@ class StagedTask:
     latency: int
     estimator: Estimator | None
     time_limit: float | None
-    disturbed: bool
-    N: int
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether disturbances, measured or estimated, move the target."""
+        return self.estimator is not None or self.map.nw > 0
+
+    @property
+    def N(self) -> int:
+        """Steps of the plan."""
+        return sum(self.moves.lengths)
 
 
 def read_staged_task(
@@ -79,8 +83,6 @@ def read_staged_task(
         latency=checks.count(latency, "latency", 0),
         estimator=estimator,
         time_limit=None if time_limit is None else checks.positive(time_limit, "time_limit", "s"),
-        disturbed=estimator is not None or given.nw > 0,
-        N=sum(blocks.lengths),
     )
 
 

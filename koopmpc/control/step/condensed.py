@@ -1,6 +1,5 @@
 """CondensedStep: the step of a plan by one matrix; where the plan meets a limit, the QP of the deviation from it."""
 
-from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -90,13 +89,17 @@ class DeviationSolver:
         else:
             self.qps.update(plan.qp)
 
+    def accepts(self, t: Float[np.ndarray, " n"], plan: CondensedPlan, limits: StepBounds) -> bool:
+        """Return whether the first entries t of a plan are inside their limits, and inputs on their levels."""
+        return limits.accepts(t, plan.ball) and (self.levels is None or self.levels.accepts(t))
+
     def solve(
         self,
         t: Float[np.ndarray, " nt"],
         plan: CondensedPlan,
         bounds: PlanBounds,
         k: int,
-        initial: InitialCondition,
+        u_prev: Float[np.ndarray, " nu"],
         deadline: float | None,
     ) -> Corrected:
         """Move the plan t by the optimal deviation, and return how the QP ended; the plan stays where it failed.
@@ -105,12 +108,11 @@ class DeviationSolver:
         ----------
         bounds, k
             The limits, and the step.
-        initial
-            Where the plan starts.
+        u_prev
+            The input before the plan; empty where it does not count.
         deadline
             The time by `perf_counter` at which the step must have ended; None for none.
         """
-        u_prev = initial.u_prev
         limits, conflict = bounds.open_rates(k, u_prev)
         rows = None if limits is None else _scale_limits(limits, plan)
         (inputs, rates), hard_rates, box = bounds.first(k), bounds.hard_rates(k), bounds.moves(k)
@@ -192,8 +194,8 @@ class CondensedStep:
     ----------
     initial, memory
         Where the plan starts, and the last plan.
-    solver
-        The QP of the deviation.
+    program, solver
+        What a step needs, and the QP of the deviation.
     bounds, row
         The limits of the last step.
     """
@@ -242,9 +244,14 @@ class CondensedStep:
         applied: ArrayLike | None = None,
         w: ArrayLike | None = None,
         called: PlanBounds | None = None,
+        *,
+        start: float,
     ) -> Move:
-        """Return the first input of the plan for measurement y; `called` are limits of this step alone."""
-        start, k, aim, initial = perf_counter(), self._k, self._aim, self.initial
+        """Return the first input of the plan for measurement y.
+
+        `called` are limits of this step alone; it began at `start` [s of `perf_counter`].
+        """
+        k, aim, initial = self._k, self._aim, self.initial
         aim.take(reference)
         initial.take(y, self.memory.given, applied, w)
         self.memory.take(applied)
@@ -262,7 +269,7 @@ class CondensedStep:
         t += aim.at(plan, bounds, row, limits.reach)
         if given is not None:
             t[: len(given)] += given
-        if limits.accepts(t, plan.ball) and (self.solver.levels is None or self.solver.levels.accepts(t)):
+        if self.solver.accepts(t, plan, limits):
             return self._return_free(t[: self._nu], t, start)
         return self._correct(t, plan, limits, applied, start)
 
@@ -294,10 +301,10 @@ class CondensedStep:
             moved = self._aim.find_push(plan.disturbance @ self.initial.drive, bounds.targets(row))
             if moved is not None:
                 t[:n] += plan.from_target.dot(moved)
-            if limits.accepts(t[:n], plan.ball) and (self.solver.levels is None or self.solver.levels.accepts(t[:n])):
+            if self.solver.accepts(t[:n], plan, limits):
                 return self._return_free(t[: self._nu], t, start)
         deadline = None if np.isinf(memory.allowed) else start + memory.allowed
-        found = self.solver.solve(t, plan, bounds, row, self.initial, deadline)
+        found = self.solver.solve(t, plan, bounds, row, self.initial.u_prev, deadline)
         if not found.is_solved:
             return self._fall_back(found, t[: self._nu], applied, start)
         u = t[: self._nu]

@@ -124,9 +124,9 @@ class InitialCondition:
         if self._measured is not None and w is None:
             self._lift(self._measured, measured)
             return
-        acted = self._find_acting(last, got if got is not None and (np.abs(got) < HUGE).all() else None)
-        if self._nw or w is not None:
+        if self._nw or w is not None:  # before the input is stored: a w that is refused changes nothing
             self._preview(w)
+        acted = self._find_acting(last, got if got is not None and (np.abs(got) < HUGE).all() else None)
         good = self.observer.observe(measured, acted, self._w)
         self.refused = getattr(self.observer, "refused", False)
         if self._nw:  # a disturbance that is not finite keeps its last value

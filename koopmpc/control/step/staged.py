@@ -4,6 +4,7 @@ What finds the plan is a `PlanSolver`: real-time iteration, or a nonlinear progr
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from time import perf_counter
 from typing import NamedTuple
 
@@ -106,8 +107,8 @@ class StagedStep:
 
     Parameters
     ----------
-    task, observer
-        What is asked, and what finds x and d.
+    task, observer, make_solver
+        What is asked, what finds x and d, and what makes the solver of plans, which gets the task and `levels`.
 
     Attributes
     ----------
@@ -116,14 +117,23 @@ class StagedStep:
     bounds, now
         The limits of any step, and of the last one.
     aim, solver
-        What the stages track, and what finds the plan; the constructor of a controller sets the solver.
+        What the stages track, and what finds the plan.
+    levels, keeper
+        The search over levels of inputs, and what keeps the accepted plan; None without.
+    task, fails
+        What is asked; while `fails` is True, each plan of the solver is dropped.
+    e
+        (N, nx) disturbances of x along the last plan.
     X, U
         The last plan.
     """
 
-    solver: PlanSolver
-
-    def __init__(self, task: StagedTask, observer: StateObserver) -> None:
+    def __init__(
+        self,
+        task: StagedTask,
+        observer: StateObserver,
+        make_solver: Callable[[StagedTask, LevelSearch | None], PlanSolver],
+    ) -> None:
         model, problem, o, N = task.map, task.problem, task.outputs, task.N
         levels = o.levels
         self._allowed = np.inf if task.time_limit is None else task.time_limit
@@ -137,7 +147,7 @@ class StagedStep:
         self.keeper = make_keeper(problem, model, o.limits) if keeps else None
         self.bounds = MovingLimits(task)
         self.now = self.bounds.at(0)
-        self.aim = StageAim(task)
+        self.aim, self.solver = StageAim(task), make_solver(task, self.levels)
         self.fails, self.task = False, task
         self.e = np.zeros((N, model.nx))  # e_k = E w_k + d_k of the step
 
@@ -172,9 +182,13 @@ class StagedStep:
         applied: ArrayLike | None = None,
         w: ArrayLike | None = None,
         called: StageLimits | None = None,
+        *,
+        start: float,
     ) -> Move:
-        """Return the first input of the plan for measurement y; `called` are limits of this step alone."""
-        start = perf_counter()
+        """Return the first input of the plan for measurement y.
+
+        `called` are limits of this step alone; it began at `start` [s of `perf_counter`].
+        """
         self._limit(self.bounds.at(self._k) if called is None else called)
         self.initial.take(y, self.memory.given, applied, w)
         self.memory.take(applied)
