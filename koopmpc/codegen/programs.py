@@ -18,7 +18,7 @@ from koopmpc.control.plan.condensed_program import BoundsProgram, CondensedProgr
 from koopmpc.control.program import Published, StepProgram, no_export
 from koopmpc.control.solvers.daqp import FEW, MOVED
 from koopmpc.control.solvers.levels import NODES
-from koopmpc.control.step import aim as motion
+from koopmpc.control.step import aim
 from koopmpc.control.step.feedback import FeedbackProgram
 from koopmpc.estimate.disturbance import EXACT, DisturbanceProgram
 from koopmpc.estimate.filter import FilterProgram
@@ -286,10 +286,10 @@ def _derive_staged(tables: Tables, p: StagedProgram) -> None:
         "TARGET": head + goal * (nr + nx + nu + 1) + 1,
         "MADE": N + 1 if p.holds else 1,
         "MADE_SIZE": head + 1,
-        "RESTS": motion.RESTS,
-        "MOST_TERMS": max(motion.ORDERS) + 1,
+        "RESTS": aim.RESTS,
+        "MOST_TERMS": max(aim.ORDERS) + 1,
     }
-    tables.arrays |= {"table": p.table.ravel(), "orders": np.array(motion.ORDERS, dtype=np.intc)}
+    tables.arrays |= {"table": p.table.ravel(), "orders": np.array(aim.ORDERS, dtype=np.intc)}
     for name in {"rest_weight", "Q_root", "R_root", "tail_end"} & tables.arrays.keys():  # C has these row after row
         tables.arrays[name] = tables.arrays[name].reshape(tables.sizes[f"{name.upper()}_WIDTH"], -1).T.ravel()
     tables.notes += [_TABLE_NOTE, *([_SCHEDULE_NOTE] if p.scheduled else [])]

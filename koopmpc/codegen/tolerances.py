@@ -8,7 +8,7 @@ from koopmpc.control.nonlinear.real_time_solver import SETTLED
 from koopmpc.control.plan.row_targets import PSEUDO
 from koopmpc.control.riccati import SETTLED as RESTED
 from koopmpc.control.solvers.sequences import EQUAL
-from koopmpc.control.step import aim as motion
+from koopmpc.control.step import aim
 from koopmpc.control.step.staged import NO_DIGITS
 from koopmpc.control.target import ROUNDING
 from koopmpc.estimate.gate import ROUNDING as AT_REST
@@ -44,13 +44,13 @@ IN_C = {
     "SMALL": (1e-7, 1e-4),
     "RESTED": (RESTED, 1e-5),
     "PSEUDO": (PSEUDO, 1e-5),
-    "FITS": (motion.FITS, 1e-4),
-    "GROWS": (motion.GROWS, 1e-3),
-    "DRIFTS": (motion.DRIFTS, 1e-4),
-    "FOLLOWS": (motion.FOLLOWS, 1e-2),
-    "STILL": (motion.STILL, 1e-5),
-    "TERMS": (motion.TERMS, 1e-5),
-    "FLAT": (motion.ROUNDING, 1e-6),
-    "BURSTS": (motion.BURSTS, 1e3),
-    "SEEN": (motion.SEEN, 1e-3),
+    "FITS": (aim.FITS, 1e-4),
+    "GROWS": (aim.GROWS, 1e-3),
+    "DRIFTS": (aim.DRIFTS, 1e-4),
+    "FOLLOWS": (aim.FOLLOWS, 1e-2),
+    "STILL": (aim.STILL, 1e-5),
+    "TERMS": (aim.TERMS, 1e-5),
+    "FLAT": (aim.ROUNDING, 1e-6),
+    "BURSTS": (aim.BURSTS, 1e3),
+    "SEEN": (aim.SEEN, 1e-3),
 }

@@ -49,7 +49,13 @@ class FunctionController:
     def __call__(
         self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None, w: ArrayLike | None = None
     ) -> Move:
-        """Return f(y, r); if y or r is not finite and u is not either, the last input."""
+        """Return f(y, r); if y or r is not finite and u is not either, the last input.
+
+        Raises
+        ------
+        DataError, ShapeError
+            The function returned no (nu,) numbers, or a number that is not finite for finite y and r.
+        """
         del w
         start = perf_counter()
         if applied is not None:

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE, numbers
 from koopmpc.base.errors import DataError
+from koopmpc.control.ask.bounds import clip_input
 from koopmpc.control.ask.levels import HeldLevels
-from koopmpc.control.ask.limits import Interval, Limits, clip_input
+from koopmpc.control.ask.limits import Interval, Limits
 from koopmpc.control.ask.preview import InputRows
 from koopmpc.control.function import as_controller
 from koopmpc.control.kinds import ControllerKind, register_controller

@@ -1,4 +1,4 @@
-"""The quadratic Cost that every controller and every metric shares, and what of a model it and the Limits read."""
+"""The quadratic Cost that every controller and every metric shares, and its checks against a plant and a controller."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -131,7 +131,7 @@ class Cost(Value):
             object.__setattr__(self, "Q_N", self.Q_N.weigh_end(replace(self, Q_N=None)))
         for name, check in COST_CHECKS.items():
             value = getattr(self, name)
-            if value is not None:
+            if value is not None or name in ("of", "u_target"):
                 object.__setattr__(self, name, check(value, name))
         refuse_contradictions(self)
 

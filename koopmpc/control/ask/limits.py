@@ -14,19 +14,13 @@ from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.base.values import Value
 from koopmpc.control.ask import bounds
 from koopmpc.control.ask.bounds import SOFTENED as SOFTENED
-from koopmpc.control.ask.bounds import Bound as Bound
+from koopmpc.control.ask.bounds import Bound, LimitRows, Slack, spread_prices, write_rows
 from koopmpc.control.ask.bounds import Interval as Interval
-from koopmpc.control.ask.bounds import LimitRows as LimitRows
 from koopmpc.control.ask.bounds import Movable as Movable
-from koopmpc.control.ask.bounds import SizedLimits as SizedLimits
-from koopmpc.control.ask.bounds import Slack as Slack
 from koopmpc.control.ask.bounds import Softness as Softness
-from koopmpc.control.ask.bounds import clip_input as clip_input
 from koopmpc.control.ask.bounds import half_width as half_width
 from koopmpc.control.ask.bounds import magnitude as magnitude
-from koopmpc.control.ask.bounds import measure_violation as measure_violation
 from koopmpc.control.ask.bounds import preview_margin as preview_margin
-from koopmpc.control.ask.bounds import spread_prices, write_rows
 from koopmpc.control.ask.checks import BOUNDS as BOUNDS
 from koopmpc.control.ask.checks import ENDS, LIMIT_CHECKS, refuse_crossed_limits, refuse_margin
 from koopmpc.control.ask.levels import DwellByInput, InputLevels, LevelsByInput, build_levels
@@ -132,7 +126,7 @@ class Limits(Value):
             raise DataError("dwell and level_steps are of inputs on levels; pass levels, or leave them out")
         for name, check in LIMIT_CHECKS.items():
             value = getattr(self, name)
-            if value is not None:
+            if value is not None or name == "rows":
                 object.__setattr__(self, name, check(value, name))
         refuse_crossed_limits(self, BOUNDS)
         refuse_margin(self)

@@ -1,4 +1,4 @@
-"""`TerminalSet`: where a plan has to end; its rows on a model's state; whether it is inside limits that move."""
+"""`TerminalSet`: where a plan has to end, and whether it is inside limits that move."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
