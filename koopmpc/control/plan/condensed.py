@@ -177,9 +177,14 @@ def plan_condensed(task: ControlTask) -> CondensedProgram:
     if not track.weighed:
         return program
     alike = replace(task, coordinates="plain" if plan.coordinates == "plain" else "riccati")
-    plans = PlansInTime(track, task.N, task.latency, program, partial(plan_matrices, alike, targets, terminal))
+    plans = PlansInTime(track, task.N, task.latency, program, partial(_plan_again, alike, targets, terminal))
     plans.check_free_inputs()
     return replace(program, plans=plans)
+
+
+def _plan_again(task: ControlTask, targets: Targets, terminal: Terminal, rows: WeightRows) -> CondensedPlan:
+    """Return the plan of a horizon with other weights and the same end."""
+    return plan_matrices(task, targets, terminal, rows)[0]
 
 
 def _add_held(
@@ -217,7 +222,7 @@ def plan_matrices(
     law = recursion(parts, terminal.P, terminal.p)
     wanted = track.limits.terminal
     end = None if wanted is None else read_end(wanted, predictor)
-    tied = bool(moves.held.any())
+    tied = moves.own
     coordinates = "riccati" if tied else task.coordinates
     maps = condense(scaled_horizon, law, terminal, aims, units, coordinates, end)
     if tied:

@@ -293,7 +293,7 @@ class PlansInTime:
     base
         The plan of Q and R, for previews that hold nothing else.
     make
-        Makes the plan of other weights, and something else.
+        Makes the plan of other weights.
     """
 
     def __init__(
@@ -302,7 +302,7 @@ class PlansInTime:
         N: int,
         latency: int,
         base: CondensedPlan,
-        make: Callable[[WeightRows], tuple[CondensedPlan, object]],
+        make: Callable[[WeightRows], CondensedPlan],
     ) -> None:
         self._track, self._N, self._latency, self._make = track, N, latency, make
         Q, R = (np.tile(weight.diagonal(), (N, 1)) for weight in (track.Q, track.R))
@@ -342,7 +342,7 @@ class PlansInTime:
         key = self._key(Q, R)
         plan = self._plans.pop(key, None)
         if plan is None:
-            plan, _ = self._make(WeightRows(Q, R))
+            plan = self._make(WeightRows(Q, R))
             while len(self._plans) >= _KEPT:
                 oldest = next(key for key in self._plans if key != self._base)
                 del self._plans[oldest]

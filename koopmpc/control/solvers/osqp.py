@@ -58,6 +58,22 @@ def _statuses() -> dict[int, Status]:
     }
 
 
+class Pattern:
+    """Where a matrix in compressed columns has entries."""
+
+    def __init__(self, matrix: scipy.sparse.csc_matrix) -> None:
+        self._shape = matrix.shape
+        columns = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
+        self._places = matrix.indices.astype(np.intp) * matrix.shape[1] + columns
+
+    def entries(self, matrix: Float[np.ndarray, "m n"]) -> Float[np.ndarray, " k"] | None:
+        """Return the entries of another matrix in the same order; None where its zeros stand elsewhere."""
+        if matrix.shape != self._shape:
+            return None
+        entries = matrix.ravel()[self._places]
+        return entries if entries.all() and np.count_nonzero(matrix) == len(entries) else None
+
+
 class OSQP(QPSolver):
     """A QP set up once in OSQP; limits move, solves start warm.
 
@@ -92,6 +108,7 @@ class OSQP(QPSolver):
 
         qp = self._qp
         P, A = scipy.sparse.csc_matrix(np.triu(qp.P)), scipy.sparse.csc_matrix(qp.A)
+        self._patterns = Pattern(P), Pattern(A)
         self._problem, self._status = osqp.OSQP(), _statuses()
         options = {"verbose": False, **DEFAULTS, **self._settings}
         try:
@@ -114,6 +131,23 @@ class OSQP(QPSolver):
         limits, rho = state
         self.set_bounds(*limits)
         self._solver.update_rho(rho)
+
+    def update(self, qp: QP) -> None:
+        """Go on with another QP of the same size; if its zeros are in other places, the solver is set up again.
+
+        Raises
+        ------
+        DataError
+            OSQP refuses the problem.
+        """
+        P, A = (pattern.entries(matrix) for pattern, matrix in zip(self._patterns, (np.triu(qp.P), qp.A), strict=True))
+        if P is None or A is None:
+            super().update(qp)
+            return
+        self._hold(qp)
+        self._solver.update_data_vec(q=qp.q, l=self.low, u=self.high)
+        if self._solver.update_data_mat(P_x=P, P_i=None, A_x=A, A_i=None):
+            raise DataError("OSQP refuses the new matrices; pass a convex QP, P ⪰ 0")
 
     def _forget(self) -> None:
         """Forget the step size ρ that earlier solves adapted: the same problem then has the same iterates."""

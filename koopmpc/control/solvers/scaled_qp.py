@@ -22,6 +22,8 @@ class ScaledQP:
     ----------
     H, f, M, columns, rows, unit
         ½ xᵀH x + fᵀx → min within limits on M x; D, the factor of each row, and of the cost.
+    multipliers
+        The factor of each row's multiplier, and of its price.
     linear, curvature, is_soft
         The price linear ε + ½ curvature ε² of a scaled row, inf and 0 where it is hard.
     is_plain
