@@ -34,6 +34,7 @@ _NATIVE = ("-march=native", "-fvisibility=default")  # of code for this processo
 # The time of a compiler grows faster than a function that CasADi wrote. 366 kB took 5 s by -O3, 1.7 s by -O1, 0.4 s by
 # -O0, and ran 6.9, 6.4 and 11.6 µs. 1.3 MB took above 100 s by -O3, 19 s by -O1, 1.3 s by -O0.
 _LEVELS = ((100_000, "-O3"), (500_000, "-O1"))  # text of at most so many characters is compiled by this level
+_SEAL = ".sha256"  # ends the name of the file beside cached machine code that holds its checksum
 _CLOSE = "FreeLibrary" if os.name == "nt" else "dlclose"
 _PROBE = 30.0  # a compiler has this long for a program of one line [s]
 _COMPILING = 900.0  # and this long for any other [s]: the largest took 100 s on a quiet machine
@@ -228,7 +229,7 @@ def _load(text: str, words: list[str], cache: Path | None) -> ctypes.CDLL:
             return open_library(_compile(text, words, Path(folder) / "step.so"))
     key = "\0".join([text, *words, _describe_host(), _describe_compiler(tuple(words))])
     path = cache / f"{fingerprint(key.encode())}.so"
-    if path.exists():
+    if _is_whole(path):
         try:
             return open_library(path)
         except OSError:  # another kind of machine wrote the file: compile again
@@ -254,6 +255,14 @@ def _describe_compiler(words: tuple[str, ...]) -> str:
         printed = subprocess.run([*words, "--version"], capture_output=True, timeout=_COMPILING, check=False).stdout
         return f"{shutil.which(words[0])} {printed.decode(errors='replace')}"
     return words[0]
+
+
+def _is_whole(library: Path) -> bool:
+    """Return whether a cached file is, to the bit, what was compiled; a damaged one could end the process."""
+    try:
+        return library.with_suffix(_SEAL).read_text() == fingerprint(library.read_bytes())
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def find_private_cache() -> Path | None:
@@ -283,9 +292,13 @@ def _is_private(folder: Path) -> bool:
 
 
 def _compile(text: str, words: list[str], path: Path) -> Path:
-    """Compile in a temporary folder beside `path`, and move the file to `path` in one step."""
+    """Compile in a temporary folder beside `path`, move the file to `path` in one step, and write its checksum."""
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        build_library(text, words, Path(folder)).replace(path)
+        library = build_library(text, words, Path(folder))
+        seal = fingerprint(library.read_bytes())
+        library.replace(path)
+        with suppress(OSError):  # code without a checksum is compiled again
+            path.with_suffix(_SEAL).write_text(seal)
     return path
 
 

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
+from koopmpc.base.values import fingerprint
 from koopmpc.plants import routines, step_map
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Routine
@@ -143,12 +144,33 @@ def test_small_batches_do_not_compile(cache):
 
 
 @needs_compiler
+@pytest.mark.parametrize("damage", ["a bit", "a cut", "no checksum"])
+def test_damaged_machine_code_in_the_cache_is_not_loaded(cache, damage, monkeypatch):
+    """Loading it could end the process: it is compiled again."""
+    X0, U = random_episodes(MAPS["rk4"], 100, 200)
+    want = km.discretize(CartPole(), 0.02).rollouts(X0, U)
+    (library,) = cache.glob("*.so")
+    data, compiled = bytearray(library.read_bytes()), []
+    data[len(data) // 2] ^= 1
+    library.unlink()
+    library.write_bytes(data[: len(data) // (2 if damage == "a cut" else 1)])
+    if damage == "no checksum":
+        library.with_suffix(".sha256").unlink()
+    compiler = routines._compile
+    monkeypatch.setattr(routines, "_compile", lambda *given: compiled.append(given) or compiler(*given))
+    for _ in range(2):
+        assert km.discretize(CartPole(), 0.02).rollouts(X0, U).tobytes() == want.tobytes()
+    assert len(compiled) == 1
+
+
+@needs_compiler
 def test_machine_code_of_another_kind_of_machine_is_written_again(cache):
     X0, U = random_episodes(MAPS["rk4"], 100, 200)
     want = km.discretize(CartPole(), 0.02).rollouts(X0, U)
     (library,) = cache.glob("*.so")
     library.unlink()
     library.write_bytes(b"no machine code here")
+    library.with_suffix(".sha256").write_text(fingerprint(library.read_bytes()))
     assert km.discretize(CartPole(), 0.02).rollouts(X0, U).tobytes() == want.tobytes()
 
 
