@@ -1,6 +1,6 @@
 """What is asked of BilinearMPC and NonlinearMPC, checked; and its limits in time: rows of u, x and y for each step."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import casadi as ca
@@ -37,6 +37,10 @@ class StagedTask:
         The blocks of held inputs, and steps until an input acts.
     estimator, time_limit
         The rule that finds d, and the wall-clock time of a step [s]; None without.
+    disturbed
+        Whether disturbances, measured or estimated, move the target.
+    N
+        Steps of the plan.
     """
 
     map: LearnedMap
@@ -46,16 +50,13 @@ class StagedTask:
     latency: int
     estimator: Estimator | None
     time_limit: float | None
+    disturbed: bool = field(init=False)
+    N: int = field(init=False)
 
-    @property
-    def disturbed(self) -> bool:
-        """Whether disturbances, measured or estimated, move the target."""
-        return self.estimator is not None or self.map.nw > 0
-
-    @property
-    def N(self) -> int:
-        """Steps of the plan."""
-        return sum(self.moves.lengths)
+    def __post_init__(self) -> None:
+        """Count the steps, and what disturbs."""
+        object.__setattr__(self, "disturbed", self.estimator is not None or self.map.nw > 0)
+        object.__setattr__(self, "N", sum(self.moves.lengths))
 
 
 def read_staged_task(

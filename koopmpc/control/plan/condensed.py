@@ -222,7 +222,7 @@ def plan_matrices(
     law = recursion(parts, terminal.P, terminal.p)
     wanted = track.limits.terminal
     end = None if wanted is None else read_end(wanted, predictor)
-    tied = moves.own
+    tied = bool(moves.held.any())
     coordinates = "riccati" if tied else task.coordinates
     maps = condense(scaled_horizon, law, terminal, aims, units, coordinates, end)
     if tied:

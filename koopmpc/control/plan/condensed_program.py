@@ -30,11 +30,11 @@ class StepBounds(NamedTuple):
     high: Float[np.ndarray, " nt"]
     reach: float
 
-    def accepts(self, t: Float[np.ndarray, " n"], ball: Ball | None) -> bool:
-        """Return whether the first entries t of a plan are inside, those of a terminal ellipsoid by their norm."""
+    def accepts(self, t: Float[np.ndarray, " n"], ball: Ball | None, levels: LevelSearch | None) -> bool:
+        """Return whether the first entries t of a plan are inside, those of a ball by their norm, and on all levels."""
         low, high = self.low[: len(t)], self.high[: len(t)]
         if is_inside(t, low, high):
-            return True
+            return levels is None or levels.accepts(t)
         if ball is None or not ball.contains(t):
             return False
         others = slice(0, ball.rows.start), slice(ball.rows.stop, None)

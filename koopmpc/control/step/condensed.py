@@ -89,17 +89,13 @@ class DeviationSolver:
         else:
             self.qps.update(plan.qp)
 
-    def accepts(self, t: Float[np.ndarray, " n"], plan: CondensedPlan, limits: StepBounds) -> bool:
-        """Return whether the first entries t of a plan are inside their limits, and inputs on their levels."""
-        return limits.accepts(t, plan.ball) and (self.levels is None or self.levels.accepts(t))
-
     def solve(
         self,
         t: Float[np.ndarray, " nt"],
         plan: CondensedPlan,
         bounds: PlanBounds,
         k: int,
-        u_prev: Float[np.ndarray, " nu"],
+        initial: InitialCondition,
         deadline: float | None,
     ) -> Corrected:
         """Move the plan t by the optimal deviation, and return how the QP ended; the plan stays where it failed.
@@ -108,11 +104,12 @@ class DeviationSolver:
         ----------
         bounds, k
             The limits, and the step.
-        u_prev
-            The input before the plan; empty where it does not count.
+        initial
+            Where the plan starts.
         deadline
             The time by `perf_counter` at which the step must have ended; None for none.
         """
+        u_prev = initial.u_prev
         limits, conflict = bounds.open_rates(k, u_prev)
         rows = None if limits is None else _scale_limits(limits, plan)
         (inputs, rates), hard_rates, box = bounds.first(k), bounds.hard_rates(k), bounds.moves(k)
@@ -269,7 +266,7 @@ class CondensedStep:
         t += aim.at(plan, bounds, row, limits.reach)
         if given is not None:
             t[: len(given)] += given
-        if self.solver.accepts(t, plan, limits):
+        if limits.accepts(t, plan.ball, self.solver.levels):
             return self._return_free(t[: self._nu], t, start)
         return self._correct(t, plan, limits, applied, start)
 
@@ -301,10 +298,10 @@ class CondensedStep:
             moved = self._aim.find_push(plan.disturbance @ self.initial.drive, bounds.targets(row))
             if moved is not None:
                 t[:n] += plan.from_target.dot(moved)
-            if self.solver.accepts(t[:n], plan, limits):
+            if limits.accepts(t[:n], plan.ball, self.solver.levels):
                 return self._return_free(t[: self._nu], t, start)
         deadline = None if np.isinf(memory.allowed) else start + memory.allowed
-        found = self.solver.solve(t, plan, bounds, row, self.initial.u_prev, deadline)
+        found = self.solver.solve(t, plan, bounds, row, self.initial, deadline)
         if not found.is_solved:
             return self._fall_back(found, t[: self._nu], applied, start)
         u = t[: self._nu]
