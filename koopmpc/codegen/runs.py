@@ -41,20 +41,35 @@ class TargetTable:
 
     def __init__(self, find: Callable[[np.ndarray], np.ndarray], kind: type[np.floating]) -> None:
         self._find, self._kind, self._lock = find, kind, Lock()
-        self._known: dict[bytes, np.ndarray] = {}
-        self._table = np.zeros((0, 1), kind)
+        self._known: set[bytes] = set()
+        self._room = self._table = np.zeros((0, 1), kind)
 
     def of(self, reference: Float[np.ndarray, "..."]) -> Float[np.ndarray, "found size"]:
         """Return the table with the rows of this reference in it: the same array while no row is new."""
         with self._lock:
-            rows = {row.tobytes(): row for row in np.atleast_2d(reference) if np.abs(row).max(initial=0) < checks.HUGE}
-            if len(self._known) + len(rows) > _ROWS:
-                self._known = {}
-            new = [key for key in rows if key not in self._known]
+            rows = np.ascontiguousarray(np.atleast_2d(reference))
+            keys, width = rows.tobytes(), rows.shape[1] * rows.itemsize
+            if self._known.issuperset([keys[i : i + width] for i in range(0, len(keys), width)]):
+                return self._table
+            rows = rows[np.abs(rows).max(axis=1, initial=0.0) < checks.HUGE]
+            finite = {row.tobytes(): row for row in rows}
+            new = [key for key in finite if key not in self._known]
+            if new and len(self._known) + len(new) > _ROWS:
+                self._known, self._table, new = set(), np.zeros((0, 1), self._kind), list(finite)
             if new:
-                self._known |= zip(new, self._find(np.array([rows[key] for key in new])), strict=True)
-                self._table = np.array(list(self._known.values()), self._kind)  # C may still read the one before
+                self._append(self._find(np.array([finite[key] for key in new])))
+                self._known.update(new)
             return self._table
+
+    def _append(self, found: Float[np.ndarray, "new size"]) -> None:
+        """Add rows. A table that was returned before keeps its rows, for C may still read it."""
+        first = len(self._table)
+        last = first + len(found)
+        if first == 0 or last > len(self._room):
+            self._room = np.zeros((2 * last, found.shape[1]), self._kind)
+            self._room[:first] = self._table
+        self._room[first:last] = found
+        self._table = self._room[:last]
 
 
 class ControllersAbreast:
@@ -248,9 +263,9 @@ class CompiledLoops:
         X, U = np.empty((E, T + 1, starts.shape[1])), np.empty((E, T, self.nu))
         X[:, 0] = starts
         slack, reports = np.zeros((E, T)), np.zeros((E, T, 4), dtype=np.intc)
+        self._aim(given)
         for e, start in enumerate(starts):
             self.reset(start if len(start) == self._sizes["NX"] else None)
-            self._aim(given)
             code.plant_measure(point_to(X[e]), point_to(Y))
             arrays = {"rows": rows, "X": X[e], "Y": Y, "U": U[e], "slack": slack[e], "reports": reports[e]}
             whole = gather_run(code, T, arrays, None, preview=True)

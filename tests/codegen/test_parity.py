@@ -28,6 +28,9 @@ from tests.control.test_random_bilinear_loops import PLANTS, learned
 from tests.tiers import few
 
 FREE, OTHERS = 1e-9, 1e-6  # share of the inputs' range
+EXACT = 1e-8  # the same where QPs are solved to the last digit
+FLOATS = 1e-3  # the same in single precision
+PARTED = 0.002  # share of steps that may end in another status, or with another plan: rounding halves a step, or not
 EPISODE = 40  # steps, after which both start again
 WILD = (50.0, 1e6, 1e29)
 COST, RATED = km.Cost(Q=[10.0, 1.0], R=0.1), km.Cost(Q=[10.0, 1.0], R=0.1, R_delta=0.3)
@@ -36,7 +39,6 @@ ROWS = np.random.default_rng(0).uniform(0.3, 1.2, (40, 2))
 WAVES = 0.75 + 0.35 * np.cos(np.arange(40)[:, None] / [3, 2] + [0, 2])
 GIVEN = np.linspace(0, 5, 30)[:, None]
 KALMAN = km.LiftedKalman(["theta", "omega"], disturbance="output", delay=2)
-LEARNS = {"estimator": km.LiftedDisturbance(), "told": "acted"}
 
 
 @dataclass
@@ -55,6 +57,7 @@ class Case:
     wild: bool = False
     far: float = 6.0  # where a loop ends
     seen: tuple[str, ...] = ()
+    near: float = OTHERS  # share of the inputs' range
 
 
 @dataclass
@@ -69,6 +72,7 @@ class Tally:
     outside: float = 0.0  # of the limits of an input, share of its range
     iterations: int = 0  # steps with other iterations
     plans: int = 0  # steps with other plans
+    parted: int = 0  # steps with another status, fallback, gap or slack
 
 
 def hold(*rows: float, every: int = 15) -> Callable[[int, int], Any]:
@@ -84,6 +88,12 @@ def end_of(end: Any, k: int, missing: float) -> Any:
     return missing if end is None else np.atleast_2d(end)[min(k, len(np.atleast_2d(end)) - 1)]
 
 
+def are_near(first: Any, second: Any, inputs: float, states: float) -> bool:
+    """Return whether two plans have the same inputs, and the states as far as measured ones decide them."""
+    size = np.maximum(1.0, np.abs(first.X))
+    return bool(np.abs(first.U - second.U).max() <= inputs and (np.abs(first.X - second.X) / size)[:2].max() <= states)
+
+
 def compare(make: Callable[..., Case], steps: int, seed: int, precision: Any = "double") -> Tally:
     """Step the controller of this seed in both; after a difference they start again."""
     case, nudged = (make(np.random.default_rng([5, seed])) for _ in range(2))
@@ -95,6 +105,10 @@ def compare(make: Callable[..., Case], steps: int, seed: int, precision: Any = "
     limits, latency = own.limits, getattr(own, "latency", 0) or 0
     box = (limits.at(0) if limits.in_time else limits).inputs(own.nu)
     span = float(np.max(box.high - np.where(np.isfinite(box.low), box.low, -box.high)))
+    on_levels = limits.base.levels is not None
+    near = (0.0, 0.0) if on_levels else (FREE, case.near)
+    if precision == "float":
+        near = (FLOATS, FLOATS)
     every, k, u, x, burst = [one for one in (own, fast, nudged) if one is not None], EPISODE, None, None, 0
     for _ in range(steps):
         if k >= EPISODE or not np.abs(x).max() < case.far:
@@ -126,14 +140,16 @@ def compare(make: Callable[..., Case], steps: int, seed: int, precision: Any = "
         free = a.status.name in ("UNCONSTRAINED", "SATURATED")
         (tally.free if free else tally.others).append(apart)
         alike = (a.status, a.fallback, a.refused) == (b.status, b.fallback, b.refused)
-        alike = alike and (staged or abs(a.slack - b.slack) <= 1e-5 * max(1.0, a.slack))
-        tally.iterations += a.iterations != b.iterations
+        if precision == "double":
+            alike = alike and a.gap == b.gap and abs(a.slack - b.slack) <= 1e-5 * max(1.0, a.slack) + spread * span
+        tally.parted += not alike
+        tally.iterations += not on_levels and a.iterations != b.iterations  # nodes of a search have no fixed order
         now = limits if not more.get("limits") else more["limits"]
         ahead = (0 if more.get("limits") else k) + latency
         for used in (a.u, b.u):
             low, high = end_of(now.u_min, ahead, -np.inf), end_of(now.u_max, ahead, np.inf)
             tally.outside = max(tally.outside, float(np.max(np.maximum(low - used, used - high))) / span)
-        if not alike or not apart <= (FREE if free else OTHERS) + spread:
+        if not alike or not apart <= near[0 if free else 1] + spread:
             said = (f"{one.status.name}/{one.fallback.name} {one.iterations}" for one in (a, b))
             tally.beyond.append(
                 f"step {k}: {' and '.join(said)}, {apart:.1e} apart, spread {spread:.1e}, |y| {np.abs(y).max():.1g}"
@@ -142,7 +158,8 @@ def compare(make: Callable[..., Case], steps: int, seed: int, precision: Any = "
             continue
         first, second = (one.plan() if hasattr(one, "plan") else None for one in (own, fast))
         if first is not None and second is not None:
-            tally.plans += not np.abs(first.U - second.U).max() <= span * ((1e-3 if staged else 1e-5) + spread)
+            close = (1e-3, 1e-6) if staged else (1e-5, 1e-5)
+            tally.plans += not are_near(first, second, span * (close[0] + spread), close[1] + span * spread)
         else:
             tally.plans += hasattr(own, "plan") and first is not second
         u, k = a.u, k + 1
@@ -160,7 +177,7 @@ def upright(
         plant, model = plants.make_pendulum()
         told.setdefault("goal", sine(0.7) if told.get("rows", 1) > 1 else hold([0.0, 0.0], [0.1, 0.0], [-0.1, 0.0]))
         own = build(of() if of else model)
-        return Case(own, plant, start=(1.5, 1.5), seen=seen, **told)
+        return Case(own, plant, start=(1.5, 1.5), seen=seen, near=EXACT, **told)
 
     return make
 
@@ -344,8 +361,13 @@ def scheduled(given: bool, **options: Any) -> Callable[..., Case]:
         own = km.BilinearMPC(
             plants.make_scheduled()[0 if given else 1], km.Cost(Q=[1, 0.1], R=0.01), limits, 8, **options
         )
-        push = lambda k: 0.8 + 0.4 * np.sin((k + np.arange(9 if k % 20 < 15 else 1)) / 7)[:, None]  # noqa: E731
-        step = lambda x, u, w: plants.drive_scheduled(x, u, w[0])  # noqa: E731
+
+        def push(k: int) -> Any:
+            return 0.8 + 0.4 * np.sin((k + np.arange(9 if k % 20 < 15 else 1)) / 7)[:, None]
+
+        def step(x: Any, u: Any, w: Any) -> Any:
+            return plants.drive_scheduled(x, u, w[0])
+
         return Case(
             own, step, hold([0.3, 0.0], [0.5, 0.0], every=30), noise=0.01, w=push, seen=("UNCONSTRAINED", "OPTIMAL")
         )
@@ -363,7 +385,11 @@ def long(more: Any = None, ends: Any = None, **options: Any) -> Callable[..., Ca
             plants.make_wave(), km.Cost([1.0, 0.1], 0.1, **(more or {})), limits, 70, solver="daqp", **options
         )
         sizes = [(0.05, 0.0), (0.05, 0.8), (0.6, 0.3), (3.0, 0.0)]
-        goal = lambda k, count: sine(sizes[k // 15 % 4][0], 0.15, sizes[k // 15 % 4][1])(k, count)  # noqa: E731
+
+        def goal(k: int, count: int) -> Any:
+            size, middle = sizes[k // 15 % 4]
+            return sine(size, 0.15, middle)(k, count)
+
         return Case(
             own,
             lambda x, u: A @ x + B @ u,
@@ -501,13 +527,16 @@ def require_alike(make: Callable[..., Case], steps: int, seed: int) -> None:
     case = tally.case
     staged = isinstance(case.controller, km.BilinearMPC)
     assert len(tally.beyond) <= staged * 0.01 * steps, tally.beyond  # where rounding decides whether a step is halved
-    assert tally.plans <= 0.01 * steps
+    assert tally.parted <= PARTED * steps, tally.beyond
+    assert tally.plans <= PARTED * steps
+    # rounding decides where rows are as good as each other; Python starts DAQP again where too many rows push, C does not
+    assert staged or tally.iterations <= 0.05 * steps
     assert tally.outside <= 1e-12
     assert set(case.seen) <= set(tally.statuses)
 
 
 @pytest.mark.parametrize("name", few(KINDS, *QUICK))
-@pytest.mark.parametrize("steps", [200, pytest.param(2_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("steps", [300, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_c_and_python_answer_alike(name, steps):
     require_alike(KINDS[name], steps, 1)
 
@@ -521,10 +550,19 @@ def test_random_controllers_answer_alike(drawn):
     require_alike(RANDOM[name], 120, seed)
 
 
-@pytest.mark.parametrize("name", few(["inputs", "soft", "swing up", "tank"], "inputs", "tank"))
-def test_floats_answer_to_a_thousandth_of_the_range(name):
-    tally = compare(KINDS[name], 200, 2, "float")
-    assert np.quantile(tally.free + tally.others, 0.95 if name == "swing up" else 0.995) <= 1e-3
+@pytest.mark.parametrize("name", few(["inputs", "soft", "tank"], "inputs", "tank"))
+@pytest.mark.parametrize("steps", [200, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_floats_answer_to_a_thousandth_of_the_range(name, steps):
+    tally = compare(KINDS[name], steps, 2, "float")
+    assert len(tally.beyond) == tally.parted, tally.beyond
+    assert tally.parted <= PARTED * steps, tally.beyond  # within a tolerance of a limit
+
+
+@pytest.mark.slow
+def test_floats_follow_a_swing_to_a_thousandth_of_the_range():
+    tally = compare(KINDS["swing up"], 200, 2, "float")
+    assert np.median(tally.free + tally.others) <= FLOATS
+    assert tally.parted <= 0.05 * 200
 
 
 def main() -> None:
@@ -544,11 +582,12 @@ def main() -> None:
             tally.others += found.others
             tally.beyond += [f"seed {seed}, {text}" for text in found.beyond]
             tally.outside, tally.plans = max(tally.outside, found.outside), tally.plans + found.plans
+            tally.parted, tally.iterations = tally.parted + found.parted, tally.iterations + found.iterations
         free, others = np.array([*tally.free, 0.0]), np.array([*tally.others, 0.0])
         sys.stdout.write(
             f"{name}: free {len(tally.free)}, beyond 1e-9 {(free > FREE).sum()}, most {free.max():.1e}; others "
             f"{len(tally.others)}, beyond 1e-6 {(others > OTHERS).sum()}, most {others.max():.1e}; differ {len(tally.beyond)}; "
-            f"plans {tally.plans}; outside {tally.outside:.1e}; {dict(tally.statuses)}\n"
+            f"parted {tally.parted}; plans {tally.plans}; iterations {tally.iterations}; outside {tally.outside:.1e}; {dict(tally.statuses)}\n"
         )
         sys.stdout.write("".join(f"  {text}\n" for text in tally.beyond[:12]))
         sys.stdout.flush()

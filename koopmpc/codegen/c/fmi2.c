@@ -79,7 +79,7 @@ NOTHING(fmi2GetString, const char **)
 NOTHING(fmi2SetInteger, const int *)
 NOTHING(fmi2SetBoolean, const int *)
 NOTHING(fmi2SetString, Texts)
-#define ABSENT(name) UNIT int name() { return ERROR; } /* whatever its arguments */
+#define ABSENT(name) UNIT int name(void) { return ERROR; } /* importers load it without a call */
 ABSENT(fmi2CancelStep) ABSENT(fmi2GetFMUstate) ABSENT(fmi2SetFMUstate) ABSENT(fmi2FreeFMUstate)
 ABSENT(fmi2SerializedFMUstateSize) ABSENT(fmi2SerializeFMUstate) ABSENT(fmi2DeSerializeFMUstate)
 ABSENT(fmi2GetDirectionalDerivative) ABSENT(fmi2SetRealInputDerivatives) ABSENT(fmi2GetRealOutputDerivatives)

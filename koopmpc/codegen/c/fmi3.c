@@ -19,8 +19,8 @@ UNIT void *fmi3InstantiateCoSimulation(const char *name, const char *token, cons
   if (unit) memcpy(&unit->log, &logger, sizeof unit->log);
   return unit;
 }
-UNIT void *fmi3InstantiateModelExchange() { return 0; } /* whatever its arguments */
-UNIT void *fmi3InstantiateScheduledExecution() { return 0; }
+UNIT void *fmi3InstantiateModelExchange(void) { return 0; } /* whatever its arguments */
+UNIT void *fmi3InstantiateScheduledExecution(void) { return 0; }
 UNIT void fmi3FreeInstance(Unit unit) { free(unit); }
 UNIT int fmi3Reset(Unit unit) {
   koopmpc_fmu_reset(unit);
@@ -96,7 +96,7 @@ NONE_OF(Boolean, bool)
 NOTHING(fmi3SetInt32, const int32_t *)
 NOTHING(fmi3GetString, const char **)
 NOTHING(fmi3SetString, Texts)
-#define ABSENT(name) UNIT int name() { return ERROR; } /* whatever its arguments; importers load them without a call */
+#define ABSENT(name) UNIT int name(void) { return ERROR; } /* importers load it without a call */
 ABSENT(fmi3GetBinary) ABSENT(fmi3SetBinary) ABSENT(fmi3GetClock) ABSENT(fmi3SetClock)
 ABSENT(fmi3GetNumberOfVariableDependencies) ABSENT(fmi3GetVariableDependencies) ABSENT(fmi3GetFMUState)
 ABSENT(fmi3SetFMUState) ABSENT(fmi3FreeFMUState) ABSENT(fmi3SerializedFMUStateSize) ABSENT(fmi3SerializeFMUState)

@@ -29,14 +29,6 @@ class Figure:
     goal: str = ""
 
 
-def cpu_time(call: Callable[..., Any], *arguments: Any, count: int = 200) -> float:
-    """Return the CPU time of a call [s], mean of `count`."""
-    start = time.process_time()
-    for _ in range(count):
-        call(*arguments)
-    return (time.process_time() - start) / count
-
-
 def cpu_time_of_rows(call: Callable[..., Any], rows: list[tuple[Any, ...]]) -> float:
     """Return the mean CPU time [s] of calls with these arguments, one after the other."""
     start = time.process_time()
