@@ -103,14 +103,14 @@ def estimate_start(
     def evaluate(w: Float[np.ndarray, "1 n"]) -> Float[np.ndarray, "1"]:
         return np.array([np.sum(explain(w)[0] ** 2)])
 
-    def differentiate(w: Float[np.ndarray, "1 n"]) -> tuple[np.ndarray, np.ndarray]:
-        gap, slope, _ = explain(w)
-        return (slope.T @ gap)[None], (slope.T @ slope)[None]
+    def step(w: Float[np.ndarray, "1 n"]) -> Float[np.ndarray, "1 n"]:
+        gap, slope, _ = explain(w)  # slopeᵀ slope would square the condition number
+        return np.asarray(np.linalg.lstsq(slope, -gap, rcond=None)[0])[None]
 
     start = np.zeros((1, course.factor.shape[1]))
     if not np.isfinite(evaluate(start)).all():
         raise DataError(f"the model's forecast of these {len(rows)} rows overflows; pass fewer first rows")
-    return course.point(explain(find_starts(evaluate, differentiate, start))[2], rows, moves)
+    return course.point(explain(find_starts(evaluate, step, start))[2], rows, moves)
 
 
 def _describe_start(

@@ -19,6 +19,27 @@ def test_as_many_rows_as_the_state_has_entries_give_it_exactly(seed, rows):
     assert np.abs(free - e.X[99 + rows : 181]).max() < 1e-8 * e.X.std()
 
 
+def test_a_state_that_one_row_and_the_growth_of_another_tell_is_exact_after_a_growth_of_a_hundred_thousand():
+    """The squared condition number of these rows is above 1e20; x1 and x2 stay apart as the first row says."""
+    A, B, K = np.array([[1.5, 1, 1], [0, 1, 0], [0, 0, 1]]), np.array([[1.0], [0], [0]]), np.array([[1.2, 1, 1]])
+    rng = np.random.default_rng(0)
+
+    def run(steps, gain):
+        X, U = [rng.uniform(-1, 1, 3)], []
+        for _ in range(steps):
+            U.append(0.3 * rng.standard_normal(1) - gain * K @ X[-1])
+            X.append(A @ X[-1] + B @ U[-1])
+        return km.Episode(X=np.array(X), U=np.array(U))
+
+    model = km.edmd(km.Episodes([run(6, 0) for _ in range(40)], 0.1), km.State())
+    held = run(30, 1)
+    seen = np.array(held.X)
+    seen[1:, 1:] = np.nan
+    seen[0] += [0, 0.5, -0.5]
+    start = km.identify.estimate_start(model, seen, held.U)
+    assert start == pytest.approx(held.X[-1] + [0, 0.5, -0.5], abs=1e-9)
+
+
 def test_more_rows_take_noise_out_of_the_state():
     rng = np.random.default_rng(1)
     plant = linear_plant(rng, 2)

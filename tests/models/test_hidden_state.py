@@ -16,6 +16,8 @@ from koopmpc.models.records.hidden import (
     SimulationError,
     simulate_hidden,
 )
+from koopmpc.models.records.neurons import ContainedError, contain, start_with_differences
+from koopmpc.models.shared.levenberg_marquardt import minimise
 from tests.models.test_subspace import linear_plant, markov, model_markov, record_of
 
 
@@ -326,6 +328,72 @@ def test_the_derivatives_by_the_neurons_are_those_of_finite_differences(degree, 
         slope = (error.evaluate(up, [data]) - error.evaluate(down, [data])) / 4e-6
         assert gradient[j] == pytest.approx(slope, rel=1e-4, abs=1e-7)
     assert np.linalg.eigvalsh(matrix).min() > -1e-9 * np.abs(matrix).max()
+
+
+def growing_model(rng, radius=1.05):
+    model = random_model(rng, 3, 1).add_neurons(rng.standard_normal((2, 4)))
+    E = model.E.copy()
+    E[:, 1:4] = np.diag([radius, 0.7, 0.2]) + 0.05 * rng.standard_normal((3, 3))
+    E[:, -2:] = rng.standard_normal((3, 2))
+    return replace(model, E=E)
+
+
+def test_the_weight_on_growth_has_the_derivative_of_finite_differences():
+    rng = np.random.default_rng(1)
+    model = growing_model(rng)
+    data, theta = random_segments(model, rng), model.parameters
+    plain, error = SimulationError(model), ContainedError(SimulationError(model))
+    gradient = error.derivatives(theta, [data])[0] - plain.derivatives(theta, [data])[0]
+    assert np.abs(gradient).max() > 100
+    for j in range(model.E.size):
+        up, down = theta.copy(), theta.copy()
+        up[j] += 1e-6
+        down[j] -= 1e-6
+        slope = (error.evaluate(up, [data]) - error.evaluate(down, [data])) / 4e-6
+        own = (plain.evaluate(up, [data]) - plain.evaluate(down, [data])) / 4e-6
+        assert gradient[j] == pytest.approx(slope - own, rel=1e-4, abs=1e-3)
+
+
+def test_a_contained_model_never_leaves_all_numbers():
+    rng = np.random.default_rng(2)
+    wild = growing_model(rng)
+    inputs, points = rng.uniform(-1, 1, (300, 1, 1)), rng.standard_normal((1, 5))
+    stopped = np.abs(simulate_hidden(wild, points, inputs)).max()  # where a state has 1000 spreads
+    model = contain(wild)
+    assert np.abs(np.linalg.eigvals(model.E[:, 1:4])).max() <= 1
+    assert np.abs(simulate_hidden(model, points, inputs)).max() < 0.5 * stopped
+    assert contain(model) is model
+    z = 1e6 * rng.standard_normal((3, 1))
+    far = z.copy()
+    for _ in range(2000):
+        far = model.E[:, 1:4] @ far  # what is left of the dynamics far away
+    assert np.abs(far).max() < 100 * np.abs(z).max()
+
+
+def test_only_eigenvalues_above_one_move_and_they_end_at_one():
+    model = growing_model(np.random.default_rng(3))
+    error, n = ContainedError(SimulationError(model)), model.order
+    model = model.with_parameters(error.project(model.parameters))
+    assert np.array_equal(error.project(model.parameters), model.parameters)
+    E, turn = model.E.copy(), np.array([[1.0, 0.3, 0.0], [0.2, 1.0, 0.1], [0.0, -0.4, 1.0]])
+    E[:, 1 : 1 + n] = turn @ np.diag([1.3, 0.7, -0.2]) @ np.linalg.inv(turn)
+    found = replace(model, E=E)
+    found = found.with_parameters(error.project(found.parameters))
+    assert np.allclose(found.E[:, 1 : 1 + n], turn @ np.diag([1.0, 0.7, -0.2]) @ np.linalg.inv(turn), atol=1e-9)
+    assert np.array_equal(found.E[:, 1 + n :], E[:, 1 + n :])
+
+
+@pytest.mark.parametrize("seed", [5, 6, 8])
+def test_a_fit_that_starts_beside_the_bound_on_eigenvalues_reaches_the_plant(seed):
+    rng = np.random.default_rng(seed)
+    start = start_with_differences(1, 1, 2, 3)
+    plant = replace(start, E=np.array([[0, 0.9, 0.2, 0.3], [0, -0.3, 0.8, 0.5]]))
+    noisy = random_segments(plant, rng, count=6, steps=40)
+    data = RecordSegments(noisy.points, noisy.inputs, simulate_hidden(plant, noisy.points, noisy.inputs))
+    near = replace(start, E=np.array([[0, 0.999, 0, 0.1], [0, 0, 0.999, 0.1]]))
+    error = ContainedError(SimulationError(near))
+    theta, _ = minimise(error, near.parameters, [data], [data], 20, project=error.project)
+    assert error.evaluate(theta, [data]) < 1e-20 < 1 < error.evaluate(near.parameters, [data])
 
 
 def test_no_free_run_of_a_model_with_neurons_grows_exponentially():

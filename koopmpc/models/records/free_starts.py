@@ -12,7 +12,7 @@ from koopmpc.models.records.hidden import (
     list_states,
     start_states,
 )
-from koopmpc.models.shared.levenberg_marquardt import find_starts, invert_softly, minimise
+from koopmpc.models.shared.levenberg_marquardt import find_starts, minimise
 
 _STEPS = 12  # Gauss-Newton steps for the states of the segments, at most
 _SOFT = 1e-9  # weight of the states' own size in such a step, as a share of the mean of its diagonal
@@ -36,18 +36,15 @@ class FreeStartsError(SimulationError):
         """Return the z_0 of each segment that explains its outputs best."""
         return find_starts(
             lambda z: _errors_of(model, z, data),
-            lambda z: self._by_starts(model, z, data),
+            lambda z: self._step(model, z, data),
             start_states(model, data.points),
             steps=_STEPS,
-            soft=_SOFT,
             shares=(1.0, 0.3, 0.1, 0.03, 0.01),
             converged=1e-14,
         )
 
-    def _by_starts(
-        self, model: HiddenModel, z: Float[np.ndarray, "m n"], data: RecordSegments
-    ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n n"]]:
-        """Return half the gradient of each segment's sum of squares by its z_0, and the Gauss-Newton matrix."""
+    def _step(self, model: HiddenModel, z: Float[np.ndarray, "m n"], data: RecordSegments) -> Float[np.ndarray, "m n"]:
+        """Return the Gauss-Newton step of each segment's sum of squares by its z_0."""
         C, (m, n) = model.H[:, :-1], z.shape
         slope, square, D = np.zeros((m, n)), np.zeros((m, n, n)), np.tile(np.eye(n), (m, 1, 1))
         ahead = list_states(model, z, data.inputs)
@@ -59,7 +56,7 @@ class FreeStartsError(SimulationError):
                 S = S * (gap[k] != 0.0)[:, None]
             slope += np.matmul(S, gap[k][..., None])[..., 0]
             square += np.matmul(S, S.swapaxes(1, 2))
-        return slope, square
+        return -_solve_softly(square, slope[..., None])[..., 0]
 
     def _assemble(
         self,
@@ -73,11 +70,19 @@ class FreeStartsError(SimulationError):
         (slope, both), (early, cross, square) = by_others, by_starts
         n = square.shape[1]
         joined = np.concatenate([early.reshape(-1, n, 1), cross], axis=2)
-        follows = np.matmul(invert_softly(square, _SOFT), joined)
+        follows = _solve_softly(square, joined)
         gradient, matrix = np.zeros(size), np.zeros((size, size))
         gradient[others] = slope - np.einsum("snw,sn->w", cross, follows[..., 0])
         matrix[np.ix_(others, others)] = both - np.tensordot(cross, follows[..., 1:], axes=([0, 1], [0, 1]))
         return gradient, matrix
+
+
+def _solve_softly(square: Float[np.ndarray, "m n n"], right: Float[np.ndarray, "m n w"]) -> Float[np.ndarray, "m n w"]:
+    """Return the solution for each matrix, with a little weight on its diagonal."""
+    n = square.shape[1]
+    weighed = square.copy()
+    weighed[:, np.arange(n), np.arange(n)] += _SOFT * np.trace(square, axis1=1, axis2=2)[:, None] / n + 1e-300
+    return np.asarray(np.linalg.solve(weighed, right), dtype=np.float64)
 
 
 def shoot(model: HiddenModel, fitted: Sets, judged: Sets, iterations: int) -> tuple[HiddenModel, int]:

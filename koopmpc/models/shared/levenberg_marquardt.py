@@ -111,24 +111,21 @@ def _keep(theta: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 
 def find_starts(
     evaluate: Callable[[Float[np.ndarray, "m n"]], Float[np.ndarray, " m"]],
-    differentiate: Callable[[Float[np.ndarray, "m n"]], tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n n"]]],
+    step: Callable[[Float[np.ndarray, "m n"]], Float[np.ndarray, "m n"]],
     starts: Float[np.ndarray, "m n"],
     *,
     steps: int = 20,
-    soft: float = 0.0,
     shares: Sequence[float] = tuple(0.5**i for i in range(8)),
     converged: float = 1e-12,
 ) -> Float[np.ndarray, "m n"]:
     """Return the first state of each of m runs that explains its rows best, by Gauss-Newton on all runs at once.
 
-    `evaluate` returns the squared error of each run, inf where it leaves the model, `differentiate` half its gradient
-    and the Gauss-Newton matrix. `soft` is the weight of a state's own size in a step, `shares` are those of a step that
-    are tried, and `converged` is the share of all errors that a step has to gain.
+    `evaluate` returns the squared error of each run, inf where it leaves the model, and `step` the Gauss-Newton step.
+    `shares` are those of a step that are tried, and `converged` is the share of all errors that a step has to gain.
     """
     errors = evaluate(starts)
     for _ in range(steps):
-        (slope, square), before = differentiate(starts), errors.sum()
-        move = -np.matmul(invert_softly(square, soft), slope[..., None])[..., 0]
+        move, before = step(starts), errors.sum()
         waits = np.ones(len(starts), dtype=np.bool_)
         for share in shares:
             trial = np.where(waits[:, None], starts + share * move, starts)
@@ -141,11 +138,3 @@ def find_starts(
         if not before - errors.sum() > converged * before:
             break
     return starts
-
-
-def invert_softly(square: Float[np.ndarray, "m n n"], soft: float) -> Float[np.ndarray, "m n n"]:
-    """Return the inverse of each matrix, with a little weight on its diagonal."""
-    n = square.shape[1]
-    weighed = square.copy()
-    weighed[:, np.arange(n), np.arange(n)] += soft * np.trace(square, axis1=1, axis2=2)[:, None] / n + 1e-300
-    return np.linalg.inv(weighed)
