@@ -226,9 +226,13 @@ def test_listed_weights_go_with_the_pairs_that_an_embedding_and_disturbances_lea
 
 def test_weights_that_do_not_fit_are_refused() -> None:
     data = random_episodes(0, [5, 4], 2, 1)
-    with pytest.raises(km.errors.ShapeError, match="there are 1 weights and 2"):
+    with pytest.raises(
+        km.errors.ShapeError, match="there are 1 weights and 2 episodes; give each episode a number, or"
+    ):
         km.moments.second_moments(data, km.State(), weights=[1.0])
-    with pytest.raises(km.errors.ShapeError, match=r"the weight of episode 1 has"):
+    with pytest.raises(
+        km.errors.ShapeError, match=r"the weight of episode 1 has shape \(5,\), expected \(4,\) or a scalar"
+    ):
         km.moments.second_moments(data, km.State(), weights=[1.0, np.ones(5)])
     with pytest.raises(km.errors.DataError, match=r"weights is array\(3\.\); pass one item an episode, or a function"):
         km.moments.second_moments(data, km.State(), weights=np.array(3.0))
@@ -238,5 +242,7 @@ def test_weights_that_do_not_fit_are_refused() -> None:
         km.moments.second_moments(data, km.State(), weights=[1.0, np.nan])
     with pytest.raises(km.errors.DataError, match="all weights are 0; give some pair a weight above 0"):
         km.moments.second_moments(data, km.State(), weights=[0.0, 0.0])
-    with pytest.raises(km.errors.DataError, match="weights are a list, which needs"):
+    with pytest.raises(
+        km.errors.DataError, match="weights are a list, which needs the order of Episodes; pass a function"
+    ):
         km.moments.second_moments(km.data.Stream([data]), km.State(), weights=[1.0, 1.0])

@@ -106,8 +106,8 @@ class OnlineEDMD:
         elif factor < 1:
             raise DataError(f"window is {window} and forgetting {factor:g}; choose one of them")
         else:
-            self._memory = WindowMemory(width, checks.count(window, "window"))
-        self._rows = np.empty((_BLOCK, width))
+            self._memory = WindowMemory(width, checks.count(window, "window"), max(_BLOCK, width))
+        self._rows = np.empty((_BLOCK if window is None else max(_BLOCK, width), width))
         self._waiting: int = 0
         long = factor < 1 and 1 / (1 - factor) >= 4 * self._n  # forecasts from a short memory cannot reveal outliers
         self._gate = OutlierGate(width, self._n, nz) if long else None
@@ -187,7 +187,7 @@ class OnlineEDMD:
         after = checks.array(x_next, "x_next", (*lead, nx))
         if w is None and nw:
             raise DataError(f"the model has {nw} measured disturbances; pass w")
-        pushed = checks.array(np.zeros((*lead, 0)) if w is None else w, "w", (*lead, nw))
+        pushed = np.zeros((*lead, 0)) if w is None or not nw else checks.array(w, "w", (*lead, nw))
         count, nz = 1 if single else len(now), self._lifting.nz
         Z = self._lift(np.concatenate([now.reshape(count, nx), after.reshape(count, nx)]))
         parts = [Z[:count, :nz], forced.reshape(count, nu), pushed.reshape(count, nw), Z[:count, nz:], Z[count:]]

@@ -25,7 +25,8 @@ Weights = Callable[[Episode], ArrayLike] | Sequence[ArrayLike] | Float[np.ndarra
 Steps = list[Float[np.ndarray, " T"]]  # the weights of each episode, one for each step
 
 _WELL_CONDITIONED = 1e6  # up to this scaled cond(Z) Gram sums lose no accuracy
-_PILOT = 4  # after so many parts, with so many pairs a regressor, ill-conditioned sums are given up
+_PILOT = 4  # ill-conditioned sums are given up after so many parts, of fewer parts after so many chunks of the first
+_PAIRS = 4  # pairs a regressor that such a judgement needs, at least
 
 
 class ReadOptions(TypedDict, total=False):
@@ -65,8 +66,8 @@ def second_moments(
         ψ acts on ζ, the state and its past, as `Delay` makes it.
     route
         "gram" sums products, "qr" updates a triangular factor. By default products are summed. If their scaled
-        condition number is above 1e6, for the first parts or for all data, everything is read again by "qr". A stream
-        that can be read only once is read by "qr".
+        condition number is above 1e6, for the first parts or chunks or for all data, everything is read again by "qr".
+        A stream that can be read only once is read by "qr".
     bilinear
         Put u⊗ψ(x) into the rows, for z⁺ = A z + B u + Σ uᵢ Nᵢ z.
     weights
@@ -98,9 +99,7 @@ def second_moments(
     reading = _ReadTask(None, bound, source.inputs, bilinear, _align_weights(weights, source))
     zero = Moments(bound, source.inputs, source.dt, 0, 0.0, "", np.empty((0, 0)), bilinear, embedding)
 
-    run: Callable[..., Iterator[_Sums]] = partial(map, read_part)
-    if (workers, scheduler, progress) != (None, None, None):
-        run = partial(map_tasks, read_part, workers=workers, scheduler=scheduler, progress=progress)
+    run = partial(map_tasks, read_part, workers=workers, scheduler=scheduler, progress=progress)
     if route is None and source.replayable:
         total = _add_up(source, reading, replace(zero, route="gram"), run, judged=True)
         if total is not None:
@@ -111,16 +110,19 @@ def second_moments(
 
 
 def _add_up(
-    source: Source, reading: "_ReadTask", zero: Moments, run: Callable[..., Iterator["_Sums"]], *, judged: bool
+    source: Source, reading: "_ReadTask", zero: Moments, run: Callable[..., Iterator["_Sums | None"]], *, judged: bool
 ) -> Moments | None:
     """Return the moments of all parts, added in order; None where `judged` Gram sums turn out ill-conditioned."""
     parts, total = source.parts(), zero
-    lazy = (replace(reading, part=part, route=cast("Route", zero.route)) for part in parts)
+    few, route = judged and isinstance(parts, Sized) and len(parts) < _PILOT, cast("Route", zero.route)
+    lazy = (replace(reading, part=part, route=route, judged=few and i == 0) for i, part in enumerate(parts))
     tasks = list(lazy) if isinstance(parts, Sized) else lazy
     for i, sums in enumerate(run(tasks), 1):
+        if sums is None:
+            return None
         each = replace(zero, **sums._asdict())
         total = total + each if total.samples else each
-        enough = i == _PILOT and total.samples >= _PILOT * total.columns.regressors.size
+        enough = i == _PILOT and total.samples >= _PAIRS * total.columns.regressors.size
         if judged and enough and total.condition > _WELL_CONDITIONED:
             return None
     if not total.samples:
@@ -147,13 +149,14 @@ class _ReadTask:
     bilinear: bool
     weights: Weights | None  # weights of the steps; None weighs all by 1
     route: Route = "gram"  # "gram" for Σ w dᵀd, "qr" for its triangular factor
+    judged: bool = False  # give the sums up if those of the first chunks are ill-conditioned
 
     def __str__(self) -> str:
         return str(self.part)
 
     def __reduce__(self) -> tuple[Any, ...]:
         arrays: Arrays = {}
-        rest = (self.inputs, self.bilinear, self.weights, self.route)
+        rest = (self.inputs, self.bilinear, self.weights, self.route, self.judged)
         return _unpack, (self.part, to_data(self.lifting, arrays), arrays, *rest)
 
 
@@ -161,14 +164,14 @@ def _unpack(part: Part, lifting: Any, arrays: Arrays, *rest: Any) -> _ReadTask:
     return _ReadTask(part, from_data(lifting, arrays), *rest)
 
 
-def read_part(reading: _ReadTask) -> _Sums:
-    """Return the sums of one part: chunks of fixed size, lifted, added in order and forgotten."""
+def read_part(reading: _ReadTask) -> _Sums | None:
+    """Return the sums of one part: chunks of fixed size, lifted, added in order and forgotten; None if given up."""
     assert reading.part is not None, "a task has a part"
     episodes = reading.part.load()
     weights = None if reading.weights is None else _check_weights(reading.weights, episodes)
     columns = row_columns(reading.lifting, reading.inputs, reading.bilinear)
-    names, total, samples, weight = columns.names, None, 0, 0.0
-    for chunk in lift_chunks(episodes, columns, weights):
+    names, total, samples, weight, judged = columns.names, None, 0, 0.0, reading.judged
+    for i, chunk in enumerate(lift_chunks(episodes, columns, weights), 1):
         if total is None:
             total = (GramSums if reading.route == "gram" else TriangularFactor)(chunk.P.shape[1], chunk.nz)
         count = len(chunk.P) - len(chunk.last)
@@ -182,6 +185,10 @@ def read_part(reading: _ReadTask) -> _Sums:
                 f"the observable {names[int(bad[0])]!r} is NaN, infinite or above 1e154 in {reading.part}; "
                 "drop it, or the episodes where it is"
             )
+        if judged and i >= _PILOT and samples >= _PAIRS * columns.regressors.size:
+            judged, defined = False, (reading.lifting, reading.inputs, 1.0)
+            if Moments(*defined, samples, weight, "gram", total.sums, reading.bilinear).condition > _WELL_CONDITIONED:
+                return None
     sums = np.zeros((len(names), len(names))) if total is None else total.sums
     return _Sums(sums, samples, weight)
 

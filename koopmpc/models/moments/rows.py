@@ -1,5 +1,6 @@
 """Rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)]: their columns, the chunks in which states are lifted, their sums and factors."""
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -252,17 +253,56 @@ class ForgettingMemory:
 
 
 class WindowMemory:
-    """The last `length` rows; their factor is made when it is asked for, so errors do not add up over time."""
+    """The factor of the last `length` rows, as a queue made of two stacks, in which nothing is subtracted.
 
-    def __init__(self, nd: int, length: int) -> None:
-        self._rows, self._length = np.empty((0, nd)), length
+    The back stack absorbs new blocks. The front stack holds a factor for each old block: that of the block and of all
+    later blocks in the front. Dropping a factor therefore removes the oldest block. When the front is empty, the back
+    becomes the front. Each row is absorbed twice, errors do not add up over time, and about 2 · length rows are held in
+    memory. The step that turns the back into the front costs as much as `length` updates.
+    """
+
+    def __init__(self, nd: int, length: int, block: int) -> None:
+        self._nd, self._length, self._block = nd, length, block
+        self._front: deque[tuple[Triangle, Table]] = deque()
+        self._back: list[Table] = []
+        self._R = empty_factor(nd)
 
     def push(self, rows: Table) -> None:
-        """Take in rows, the newest last."""
-        self._rows = np.vstack([self._rows, rows])[-self._length :]
+        """Absorb a block of rows, the newest last."""
+        absorb(self._R, rows)
+        self._back.append(rows.copy())
+        self._drop(0)
 
     def factor(self, pending: Table) -> tuple[Triangle, float]:
         """Return R and the number of rows in the window, whose last rows are the pending ones."""
-        rows, R = np.vstack([self._rows, pending])[-self._length :], empty_factor(self._rows.shape[1])
-        absorb(R, rows)
-        return R, float(len(rows))
+        pending = pending[-self._length :]
+        old = self._drop(len(pending))
+        if old:
+            self._turn()
+        R = self._R.copy(order="F")
+        if old:
+            absorb(R, self._front[0][1][old:])
+        if len(self._front) > bool(old):
+            absorb(R, self._front[bool(old)][0])
+        absorb(R, pending)
+        return R, float(self._length_held - old + len(pending))
+
+    @property
+    def _length_held(self) -> int:
+        return (len(self._front) + len(self._back)) * self._block
+
+    def _drop(self, waiting: int) -> int:
+        """Drop the blocks before the window; return the number of rows of the oldest block that lie before it."""
+        while self._length_held + waiting - self._length >= self._block:
+            self._turn()
+            self._front.popleft()
+        return max(self._length_held + waiting - self._length, 0)
+
+    def _turn(self) -> None:
+        """Turn the back into the front if the front is empty."""
+        if not self._front:
+            R = empty_factor(self._nd)
+            for rows in reversed(self._back):
+                absorb(R, rows)
+                self._front.appendleft((R.copy(order="F"), rows))
+            self._back, self._R = [], empty_factor(self._nd)
