@@ -91,7 +91,9 @@ class Present(Lifting):
 
     def bind(self, states: Sequence[str]) -> "Present":
         """Return the copy on these names of ζ; its lifting stays bound to those of x."""
-        return replace(self, bound=tuple(states))
+        bound = replace(self, bound=tuple(states))
+        _ = bound.names  # checks the states
+        return bound
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return the names of the lifting's own observables."""
@@ -172,7 +174,9 @@ class Standardized(Lifting):
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return the inner names, each with ``~`` and a checksum of mean and scale: a name fixes the function."""
-        return _tag_names(self.lifting, states, "~", ("mean", self.mean), ("scale", self.scale))
+        return _tag_names(
+            self.lifting, states, "~", "standardize by data of these states", ("mean", self.mean), ("scale", self.scale)
+        )
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return the inner formula of the standardized states."""
@@ -224,7 +228,7 @@ class Saturated(Lifting):
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return the inner names, each with ``|`` and a checksum of the bounds: a name fixes the function."""
-        return _tag_names(self.lifting, states, "|", ("low", self.low), ("high", self.high))
+        return _tag_names(self.lifting, states, "|", "pass one for each", ("low", self.low), ("high", self.high))
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return the inner formula of the bounded states."""
@@ -241,14 +245,13 @@ def _bound(x: ca.SX, low: float, high: float) -> ca.SX:
 
 
 def _tag_names(
-    lifting: Lifting, states: tuple[str, ...], sign: str, *values: tuple[str, Float[np.ndarray, " nx"]]
+    lifting: Lifting, states: tuple[str, ...], sign: str, advice: str, *values: tuple[str, Float[np.ndarray, " nx"]]
 ) -> tuple[str, ...]:
     """Return the names of a lifting, each with a sign and a checksum of these values, one number for each state."""
     what, parts = " and ".join(name for name, _ in values), [value for _, value in values]
     if len(states) != len(parts[0]):
         raise ShapeError(
-            f"{what} have {len(parts[0])} entries and there are {len(states)} states ({', '.join(states)}); "
-            "pass one for each, or standardize by data of these states"
+            f"{what} have {len(parts[0])} entries and there are {len(states)} states ({', '.join(states)}); {advice}"
         )
     tag = f"{sign}{checksum(*(value.tobytes() for value in parts)):08x}"
     return tuple(name if name == CONSTANT else name + tag for name in lifting.names)

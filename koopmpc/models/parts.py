@@ -149,7 +149,7 @@ def build_step_map(
     return StepMap(F, predictor.dt, states=predictor.point_names, inputs=predictor.inputs, disturbances=disturbances)
 
 
-def is_state_space(given: object) -> bool:
+def _is_state_space(given: object) -> bool:
     """Return whether an object has the four matrices of a state-space system."""
     return all(hasattr(given, name) for name in _MATRICES) and not hasattr(given, "lifting")
 
@@ -164,9 +164,9 @@ def read_state_space(
 
     A continuous system is discretised by a zero-order hold of `dt` seconds.
     """
-    if not is_state_space(system) and hasattr(system, "to_ss"):
+    if not _is_state_space(system) and hasattr(system, "to_ss"):
         system = system.to_ss()
-    if not is_state_space(system):
+    if not _is_state_space(system):
         raise DataError(f"system is {checks.article(system)}; pass scipy.signal.StateSpace or control.ss")
     A, B, C, D = (checks.array(getattr(system, name), name, (None, None)) for name in _MATRICES)
     if D.any():

@@ -2,10 +2,10 @@
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple, overload
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError, FitWarning
@@ -83,7 +83,8 @@ class MeasuredError(MultiStepError):
             if model.is_scheduled:
                 columns += [np.tile(moving, nw), np.full(nw * nu, crossed)]
         self.columns = np.concatenate(columns)
-        super().__init__(model, size, np.flatnonzero(np.tile(self.columns, model.nx)))
+        self.free: Int[np.ndarray, " p"] = np.flatnonzero(np.tile(self.columns, model.nx))
+        super().__init__(model, size, self.free)
         self.past = 0 if model.embedding is None else model.embedding.steps
         self._npoint = len(model.point_names)
         self.start_size: Float[np.ndarray, " ns"] = np.tile(size, self.past + 1)
@@ -174,6 +175,28 @@ class _Found(NamedTuple):
     simulated: Episodes
 
 
+@overload
+def unequal_rates(
+    data: PartialEpisodes,
+    lifting: Lifting,
+    *,
+    embedding: Delay | None = None,
+    bilinear: Literal[False] = False,
+    scheduled_inputs: bool = False,
+    horizon: int | None = None,
+    iterations: int = 100,
+) -> LinearPredictor: ...
+@overload
+def unequal_rates(
+    data: PartialEpisodes,
+    lifting: Lifting,
+    *,
+    embedding: Delay | None = None,
+    bilinear: Literal[True],
+    scheduled_inputs: bool = False,
+    horizon: int | None = None,
+    iterations: int = 100,
+) -> BilinearPredictor: ...
 def unequal_rates(
     data: PartialEpisodes,
     lifting: Lifting,
@@ -239,6 +262,8 @@ def unequal_rates(
     checks.kind(data, "data", PartialEpisodes, "pass km.data.PartialEpisodes(X=[…], U=[…], dt=…)")
     checks.kind(lifting, "lifting", Lifting, "for example km.State()")
     iterations = checks.count(iterations, "iterations")
+    if bilinear and not data.inputs:
+        raise DataError("the runs have no inputs, so nothing multiplies the state; leave bilinear out")
     if scheduled_inputs and not (bilinear and data.disturbances):
         raise DataError("scheduled_inputs multiply inputs by measured disturbances; pass W, and bilinear=True")
     if embedding is not None:
@@ -254,16 +279,18 @@ def unequal_rates(
     past = 0 if embedding is None else embedding.steps
     wanted = _choose_horizon(data, horizon, past)
     size = np.nanstd(np.concatenate(data.X), axis=0)
+    line = _bridge(data, "line")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FitWarning)  # rows with bridged gaps are a start alone
-        model = fit(_bridge(data, "line"))
+        model = fit(line)
     if not set(data.states) <= set(model.lifting.names):
         raise DataError(f"the lifting lacks a state; pass km.State() + … of {', '.join(data.states)}")
     places, error = rows_of_states(model), MeasuredError(model, np.where(size > 0, size, 1.0), crossed=scheduled_inputs)
     lengths = sorted({max(wanted // 2, past + 1), wanted})
     best: _Found | None = None
     for kind in ("line", "held", "mean"):
-        found = _fit_from(data, error, model, _bridge(data, kind), lengths, iterations)
+        bridged = line if kind == "line" else _bridge(data, kind)
+        found = _fit_from(data, error, model, bridged, lengths, iterations)
         best = found if best is None or found.value < best.value else best
         if best.value < _EXACT:
             break
@@ -343,7 +370,7 @@ def _minimise(
         for _trial in range(_TRIALS):
             move, moved = slopes.solve(damping)
             step = np.zeros(theta.size)
-            step[np.flatnonzero(np.tile(error.columns, len(theta)))] = move
+            step[error.free] = move
             trial = theta + step.reshape(theta.shape), starts + moved * error.start_size
             lower = error.evaluate_from(*trial, cells)
             if lower < value:

@@ -206,7 +206,7 @@ def test_fits_say_what_they_cannot_take():
     with pytest.raises(km.errors.DataError, match="a segment has 2 steps, and the embedding keeps 2"):
         km.identify.unequal_rates(data, km.State(), embedding=km.Delay(2))
     still = km.data.PartialEpisodes(X=[X], U=[np.zeros((2, 0))], dt=0.1)
-    with pytest.raises(km.errors.DataError, match="the episodes have no inputs"):
+    with pytest.raises(km.errors.DataError, match="no inputs, so nothing multiplies"):
         km.identify.unequal_rates(still, km.State(), bilinear=True)
 
 

@@ -40,7 +40,12 @@ _WORDS = {"ls": "", "tls": "total least squares, ", "fb": "forward and backward,
 def fit_regression(
     regression: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls", towards: Towards = "zero"
 ) -> LinearPredictor:
-    """Return the model of min Σ ‖ψ(x⁺) − A ψ(x) − B u‖²."""
+    """Return the model of min Σ ‖ψ(x⁺) − A ψ(x) − B u‖² + ridge ‖[A B] S‖², with what was done in its report.
+
+    S holds the column norms of the regressors on its diagonal; it is the identity without a rank where the regression
+    is not `scaled`. `ridge`, `rank`, `method` and `towards` are those of `edmd`: a rank gives z = U_rᵀ ψ(x), and a
+    method other than "ls" needs a regression that was read with ``noisy=True``, so that the rows hold all of T.
+    """
     _check_method(rank, method, towards)
     ridge = check_ridge(ridge)
     if method != "ls" and ridge != 0:

@@ -8,19 +8,17 @@ from scipy.linalg import solve_triangular
 
 from koopmpc.models.moments.rows import ForgettingMemory, Table, Triangle
 
-# The gate of outliers:
-
 
 @dataclass(frozen=True)
 class _Gate:
-    """The gate of outliers."""
+    """When a row counts as an outlier."""
 
     beyond: float = 30.0  # a row is an outlier if an innovation is above so many times the spread of its column
     least: float = 0.01  # the spread of a column counts as at least this share of the column's size
     memory: float = 0.01  # weight of a new row in the running spread and size
     few: int = 20  # the gate judges innovations after so many of them, and sizes after so many rows
     far: float = 1000.0  # without a forecast, a row is an outlier if a value is above so many times its column's size
-    fallen: float = 0.01  # signals have fallen if a column stays below this share of its size for FEW rows
+    fallen: float = 0.01  # signals have fallen if a column stays below this share of its size for `few` rows
 
 
 _GATE = _Gate()

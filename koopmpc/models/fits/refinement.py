@@ -304,7 +304,7 @@ def with_coefficients(
     if report is not None:
         report = replace(report, changes=(*report.changes, sentence))
     if isinstance(model, LinearPredictor):
-        return change_model(model, A=A, B=B, E=E, report=report)
+        return change_model(model, A=A, B=B, E=E, report=report, exact_modes=None)  # they were those of the old A
     N, S, M = model.N.copy(), model.S.copy(), model.M.copy()
     N[:, rows] = of_N.reshape(len(rows), nu, nz).transpose(1, 0, 2)
     if model.is_scheduled:

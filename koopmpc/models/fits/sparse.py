@@ -34,6 +34,11 @@ def lasso(
 ) -> tuple[Float[np.ndarray, "n nt"], float]:
     """Return argmin ½ tr KᵀGK − tr KᵀH + the penalty of K, by accelerated proximal gradient with restarts.
 
+    G = PᵀP and H = PᵀT of regressors P and targets T. The penalty is the sum of `weights` ≥ 0 times |entries| of K; if
+    `grouped`, it is that of the first column of `weights` times the Euclidean norms of K's rows, so that whole rows
+    become zero. The second result is the largest violation of the optimality conditions, which is at most `tolerance`
+    times the largest entry of H unless the steps ran out.
+
     References
     ----------
     Beck & Teboulle, "A fast iterative shrinkage-thresholding algorithm", SIAM J. Imaging Sci. 2, 2009; restart:

@@ -53,6 +53,9 @@ def select_forward(
     less its projection on the columns taken before. Columns and target are deviations from their means, so a constant
     is always among the regressors. All of this follows from their products, by a Cholesky factorisation that pivots.
 
+    `products` is PᵀP, `cross` Pᵀy and `energy` ‖y‖². Columns with ‖p_j‖² up to `floor` count as constant and are not
+    taken. The result holds the places of at most `most` columns, of fewer where the rest explains nothing.
+
     References
     ----------
     Chen, Billings & Luo, "Orthogonal least squares methods and their application to non-linear system
