@@ -202,9 +202,11 @@ class Measured(Gated):
         self._gate = ReadingGate(model.ny, leaps=True) if self._remembers or model.embedding is not None else None
         self._nothing, self._known_z = np.full(model.ny, np.nan), False
         self._nothing_z = np.full(model.nz, np.nan)
-        self._foreseen = self._expected = self._nothing_z  # the z of the last prediction, of a w and that was used
+        self._foreseen = self._nothing_z  # z of the last prediction
+        self._expected = self._nothing_z  # z that the last reading was compared with; a gate may have chosen its w
         self._acted = np.zeros(model.nu)
-        self._from, self._bridged = np.zeros(model.nz), 0  # what the next prediction starts from; missed readings since
+        self._from = np.zeros(model.nz)  # z from which the next prediction starts
+        self._bridged = 0  # readings missed in a row, for each of which a prediction stood in
         self.z: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.d: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.lift = None if model.lifting is None else buffer_lifting(model.lifting)

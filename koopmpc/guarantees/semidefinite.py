@@ -93,7 +93,8 @@ class _Program:
         self.L: Any = model.Variable((m, n))
         self.tau_x, self.tau_u = model.Variable(nonneg=True), model.Variable(nonneg=True)
         c = max(task.c_x, task.c_u)
-        self.c, self.unit = c, np.sqrt(c) if c > 0 else 1.0  # τ = c θ, rows over √c: all entries are of one size
+        self.c = c
+        self.unit = np.sqrt(c) if c > 0 else 1.0  # rows count over √c, and τ over c: entries are of one size
         self.next, self.v, self.held = A @ self.P + B @ self.L, self.L, self.P
         self.top: Any = task.decay * self.P
         self.lam: Any = None

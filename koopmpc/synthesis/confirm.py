@@ -25,13 +25,13 @@ class ChosenController:
     """The controller of a design, and what it was chosen from."""
 
     judged: JudgedRows  # the leaderboard, with the task and its data
-    # controller, best: the controller that is fitted to all data, and the place of its row
+    # controller, best: the controller, fitted to all data, and the place of its row in the leaderboard
     controller: Designed
     best: int
-    # linear, best_linear: the best linear one, and the place of its row; None where none was confirmed
+    # linear, best_linear: the best linear controller, and the place of its row; both None if none was confirmed
     linear: Designed | None
     best_linear: int | None
-    standby: Any  # A plain linear controller of the states alone; None where no such model was tried
+    standby: Any  # plain linear controller of the states alone; None if no such model was tried
     pool: LoopPool  # the distribution of fresh loops
     compared: int = 0  # number of loops in which finalists were compared
     promise: CoveragePromise | None = None  # what the margin promises; None where no share of loops was asked for

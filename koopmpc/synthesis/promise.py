@@ -12,7 +12,7 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.synthesis.choice import DesignRow
 from koopmpc.synthesis.confirm import ChosenController
 from koopmpc.synthesis.designed import Design, Evidence
-from koopmpc.synthesis.loops.abreast import speed_up
+from koopmpc.synthesis.loops.abreast import explain_python, speed_up
 from koopmpc.synthesis.loops.conditions import LoopTest
 from koopmpc.synthesis.loops.finalists import compare_longer_horizon
 from koopmpc.synthesis.loops.fresh import describe_outside, find_blind_range, find_blind_reference, run_fresh_loops
@@ -42,10 +42,8 @@ def expect_loops(chosen: ChosenController, options: DesignOptions, few: int, rng
         fast = speed_up(controller)
         count = MANY if options.loops is None and isinstance(fast, Compiled) else few
         if options.loops is None and count == few:
-            notes.append(
-                f"{few} fresh loops ran in place of {MANY}, in Python: no C compiler was found ($CC, cc, gcc, "
-                f"clang), or this controller has no C code; loops={MANY} takes longer"
-            )
+            why = explain_python(controller)
+            notes.append(f"{few} fresh loops ran in place of {MANY}, for {why}; loops={MANY} takes longer")
         fresh = run_fresh_loops(chosen.pool, fast, count, rng)
         if test.task.along:
             notes.append(ALONG.format(count=len(posed.data.held)))

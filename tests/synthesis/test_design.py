@@ -2,6 +2,7 @@
 
 import importlib
 import warnings
+from dataclasses import replace
 from functools import cache
 
 import casadi as ca
@@ -19,7 +20,7 @@ from tests.tiers import slow
 A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.005], [0.1]])  # a mass with friction; its position is free
 
 
-confirm = importlib.import_module("koopmpc.synthesis.confirm")
+confirm, rounds = (importlib.import_module(f"koopmpc.synthesis.{name}") for name in ("confirm", "rounds"))
 
 
 COST = km.Cost(Q=[1.0, 0.1], R=0.1)
@@ -349,6 +350,30 @@ def test_a_controller_that_turns_when_it_is_fitted_to_all_data_is_passed_over(mo
     assert found.controller is not seen[0]
     assert any(note.startswith("passed over: ") for note in found.notes)
     assert found.best == found.leaderboard[found.chosen]
+
+
+def test_a_model_that_is_not_that_of_the_folds_is_not_confirmed():
+    test, jobs = [], []
+    judged = rounds.judge_job
+
+    def kept(one, job):
+        test.append(one)
+        jobs.append(job)
+        return judged(one, job)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rounds, "judge_job", kept)
+        found = designed(data())
+    last = next(job for job in jobs if job.recipe == found.best.recipe and len(job.conditions) == 12)
+    outcome = judged(test[-1], last)
+    conditions = [test[-1].conditions[place] for place in last.conditions]
+    usual = [one.gain == 1.0 and np.isfinite(cost) for one, cost in zip(conditions, outcome.cost, strict=True)]
+    assert 0 < sum(usual) < len(usual)  # weights of fits are around states of runs with inputs as in the data
+    assert len(outcome.visited) == sum(usual) * (test[-1].task.steps + 1)
+    assert confirm.is_confirmed(test[-1], found.controller, outcome)
+    model = found.controller.predictor
+    wrong = km.KoopmanMPC(replace(model, B=-model.B), COST, LIMITS, 8)
+    assert not confirm.is_confirmed(test[-1], wrong, outcome)
 
 
 def test_a_single_wrong_measurement_is_replaced_and_its_episode_kept():

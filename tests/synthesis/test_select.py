@@ -231,10 +231,11 @@ def test_one_long_episode_is_cut_into_blocks_and_the_choice_says_so():
 
 
 @pytest.mark.parametrize(
-    ("lengths", "expected"), [([3] * 20 + [40] * 10, 20), ([15] * 20, 13), ([15] * 20 + [400], 20)]
+    ("lengths", "expected"),
+    [([40] * 20, 20), ([3] * 20 + [40] * 10, 20), ([15] * 20, 13), ([15] * 20 + [400], 20), ([60], 13), ([500], 20)],
 )
 def test_the_usual_horizon_is_twenty_steps_or_what_most_data_allow_and_then_a_note_says_so(lengths, expected):
-    X = np.random.default_rng(0).standard_normal((401, 1))
+    X = np.random.default_rng(0).standard_normal((501, 1))
     data = km.Episodes([km.Episode(X=X[: n + 1], U=np.zeros((n, 0))) for n in lengths], 0.1)
     found = select(data, candidates=[km.State()], delays=[2], ridges=[1e-6])
     assert found.horizon == expected

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from koopmpc.base.errors import KoopmpcError
 from koopmpc.codegen.compiled import Compiled, NoCompilerWarning, compiled
+from koopmpc.codegen.programs import make_tables, read_program
 from koopmpc.control.move import Fallback, Status
 from koopmpc.loop.run import Run
 from koopmpc.plants.routines import find_compiler
@@ -60,6 +61,17 @@ def speed_up(controller: Any) -> Any:
             return compiled(controller)
     except KoopmpcError:
         return controller
+
+
+def explain_python(controller: Any) -> str:
+    """Return why the loops of a controller that `speed_up` did not change run in Python."""
+    try:
+        make_tables(read_program(controller, ()), single=False)
+    except KoopmpcError as error:
+        return f"this controller has no C code ({error})"
+    if find_compiler() is None:
+        return "no C compiler was found ($CC, cc, gcc, clang): install one"
+    return "the C compiler failed"
 
 
 def run_abreast(

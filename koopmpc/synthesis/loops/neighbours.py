@@ -25,12 +25,13 @@ class NeighbourSettings:
     most_rows: int = 6000  # rows that are kept
     near: int = 3  # neighbours for each coefficient say whether a row is inside the data
     least: int = 12  # neighbours at least
-    # neighbours for each coefficient of the local slope, and its ridge, as a share of its largest squared direction
+    # choices of the local slope: neighbours for each coefficient, and the ridge, as a share of the largest variance
+    # among the columns of v
     slopes: tuple[tuple[int, float], ...] = ((3, 1e-4), (3, 1e-2), (3, 1.0), (20, 1e-4), (20, 1e-2), (20, 1.0))
-    ahead: int = 10  # steps of the forecasts that choose among them
+    ahead: int = 10  # steps of the forecasts that choose among `slopes`
     begun: int = 400  # of these forecasts, at most
     groups: int = 8  # of episodes; each is forecast by the rows of the others
-    alike: float = 1.05  # the first of them is taken whose error is at most this many times the least one
+    alike: float = 1.05  # the first of `slopes` is taken whose error is at most this many times the least one
     known: float = 0.99  # share of the data's own rows that is inside the data
     room: float = 1.5  # a row is outside if its neighbours are this many times as far as those of `known`
     probes: int = 256  # points of the goal's range that are looked up in the data

@@ -70,8 +70,8 @@ class Tried(Value):
 
     candidate: Candidate  # the candidate that was tried
     ridges: tuple[float, ...]  # tikhonov weights as in `edmd`
-    # (ridges, folds, horizon) root-mean-square error over the states h steps ahead, each relative to the state's
-    # spread; infinite from the step on at which the forecasts of a fold diverge
+    # (ridges, folds, horizon) root mean square over the states of the error h steps ahead, relative to each state's
+    # spread. Once the forecasts of a fold diverge, its later errors are infinite.
     errors: Float[np.ndarray, "ridges folds horizon"]
     inputs: int  # number of columns of B and E
     A: Float[np.ndarray, "ridges nz nz"]  # (ridges, nz, nz) matrices A, fitted to all folds

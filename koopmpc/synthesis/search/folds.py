@@ -32,8 +32,8 @@ def usual_horizon(episodes: Episodes, past: int = 0) -> tuple[int, tuple[str, ..
     that the shortest ones do not determine the horizon. A single episode is later cut into four blocks.
     """
     lengths = np.sort([len(episode) for episode in episodes])[::-1]
-    held = np.cumsum(lengths) >= lengths.sum() / 2
-    half = int(lengths[np.argmax(held)])  # episodes as long as this hold half of the steps
+    reached = np.cumsum(lengths) >= lengths.sum() / 2
+    half = int(lengths[np.argmax(reached)])  # episodes of at least this length hold half of all steps
     room = half if np.sum(lengths >= half) > 1 else half // 4
     ahead = min(_AHEAD, max(room - past, 1))
     if ahead == _AHEAD:
@@ -47,9 +47,8 @@ def usual_horizon(episodes: Episodes, past: int = 0) -> tuple[int, tuple[str, ..
 def make_folds(episodes: Episodes, needed: int, folds: int, rng: np.random.Generator) -> Folds:
     """Return the episodes in folds of about equal size; few long ones are first cut into blocks.
 
-    Episodes are dealt out at random. Neighbouring blocks are alike, so blocks keep their order and a fold is one
-    stretch of time.
-
+    Episodes of fewer than `needed` steps are left out, for no forecast fits into them. The others are dealt out at
+    random. Neighbouring blocks are alike, so blocks keep their order and a fold is one stretch of time.
     """
     notes: list[str] = []
     long = [episode for episode in episodes if len(episode) >= needed]

@@ -107,9 +107,9 @@ def refine_structure(
     """Return the model refined on forecasts of many steps, and of how many; the model and 0 where unseen rows lose.
 
     In turn the structure is fitted without one quarter of each record and refined there, on segments of 2.5 and of 10
-    horizons. Errors on both halves of the quarters, in free run and in short forecasts, decide between the three: over
-    these eight blocks a refinement must err by more than one standard error less, and on most of them. The model of all
-    rows is then refined in the same way.
+    horizons. Errors in free run and in short forecasts on the halves of the quarters, eight blocks, compare the model
+    with the two refinements. A refinement wins if it errs less on most blocks, and by more than one standard error on
+    average. The model of all rows is then refined in the same way.
     """
     truth, relift = cut_pieces(data), isinstance(model, BilinearPredictor)
     room = min(map(len, truth)) - max(DELAYS)  # of segments, which have a past
