@@ -229,7 +229,7 @@ def rewrite(log: Path, path: Path, seed: int | None = None, longer: int = 0) -> 
     written.disconnect()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(6))
 def test_rows_come_in_order_of_their_steps_whatever_that_of_their_batches(seed: int, tmp_path: Path) -> None:
     """A log without its checksum was not closed, and says so though all steps are there."""
     run, path = make_run(T=450), tmp_path / "again.rrd"

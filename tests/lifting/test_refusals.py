@@ -85,7 +85,8 @@ MISTAKES = [
     (DATA, r"Fourier does not know its states yet; call .bind\(states\)", lambda: km.Fourier(2)([[1.0]])),
     (DATA, "Sum does not know its states yet", lambda: (km.State() + km.Constant()).names),
     (DATA, "State does not know its states yet", lambda: km.State().symbolic(ca.SX.sym("x", 2))),
-    (SHAPE, r"x has 2 states, the lifting", lambda: km.State().bind(NAMES)([[1.0, 2.0]])),
+    (SHAPE, r"x has 2 states, the lifting was bound to 3 \(theta \[rad\], omega \[rad/s\], p \[m\]\)",
+        lambda: km.State().bind(NAMES)([[1.0, 2.0]])),
     (SHAPE, r"x has shape \(2, 2, 3\), the lifting", lambda: km.State().bind(NAMES)(np.zeros((2, 2, 3)))),
     (SHAPE, r"x has shape \(\), the lifting was bound to 3", lambda: km.State().bind(NAMES)(1.0)),
     (SHAPE, "x has 4 states, the lifting", lambda: km.State().bind(NAMES).symbolic(ca.SX.sym("x", 4))),
@@ -101,13 +102,15 @@ MISTAKES = [
     (SHAPE, r"centers has shape \(2,\), expected \(any, any\)", lambda: km.ThinPlate([0, 1])),
     (DATA, "centers holds 1 NaN or inf", lambda: km.Gaussian([[0, np.nan]], 1)),
     (DATA, "width is 0; it must be above zero", lambda: km.Gaussian([[0, 1]], 0)),
-    (DATA, r"fn returns shape \(1, 1\) and", lambda: km.Expressions(lambda x: [x[0]], ["a", "b"]).bind(NAMES)),
+    (DATA, r"fn returns shape \(1, 1\) and names has 2; return one expression for each name",
+        lambda: km.Expressions(lambda x: [x[0]], ["a", "b"]).bind(NAMES)),
     (DATA, "two observables are named", lambda: km.Expressions(lambda x: [x[0], x[1]], ["a", "a"]).bind(NAMES)),
     (DATA, "uses the operation 'erfinv'", lambda: km.Expressions(lambda x: [ca.erfinv(x[0])], ["a"]).bind(NAMES)),
     (DATA, r"call .bind\(states\), which traces", lambda: to_data(km.Expressions(lambda x: [x[0]], ["a"]))),
     (DATA, "uses the operation 'erfinv'", lambda: to_data(Error().bind(NAMES))),
     (DATA, "Drag does not know its states yet", lambda: to_data(Drag())),
-    (SHAPE, r"Wide.formula returns shape \(2, 1\), but", lambda: Wide().bind(NAMES).symbolic(ca.SX.sym("x", 3))),
+    (SHAPE, r"Wide.formula returns shape \(2, 1\), but names 1 observables; return a column of 1",
+        lambda: Wide().bind(NAMES).symbolic(ca.SX.sym("x", 3))),
     (
         DATA,
         r"a stream is read once, by the fit; take Standardized\.of from",
@@ -115,15 +118,18 @@ MISTAKES = [
             km.data.Stream(iter([km.Episodes([km.Episode(X=np.zeros((4, 3)))], 0.1)])), km.State()
         ),
     ),
-    (DATA, "scale holds 0; it must be", lambda: km.lifting.Standardized(km.State(), [0, 0], [1, 0])),
+    (DATA, "scale holds 0; it must be above zero for every state",
+        lambda: km.lifting.Standardized(km.State(), [0, 0], [1, 0])),
     (SHAPE, r"scale has shape \(1,\), expected \(2,\)", lambda: km.lifting.Standardized(km.State(), [0, 0], [1])),
-    (SHAPE, "mean and scale have 2 entries", lambda: km.lifting.Standardized(km.State(), [0, 0], [1, 1]).bind(NAMES)),
+    (SHAPE, "mean and scale have 2 entries and there are 3 states",
+        lambda: km.lifting.Standardized(km.State(), [0, 0], [1, 1]).bind(NAMES)),
     (DATA, "count is 0; it must be at least 1", lambda: km.RandomFourier(0, 1.0)),
     (DATA, "width is 0; it must be above zero", lambda: km.RandomFourier(3, 0.0)),
     (DATA, "frequencies and phases belong together", lambda: km.RandomFourier(3, 1.0, phases=[0, 0, 0])),
-    (SHAPE, "frequencies has 1", lambda: km.RandomFourier(1, 1.0, frequencies=[[1.0]], phases=[0.0], bound=NAMES)),
+    (SHAPE, "frequencies has 1 columns and there are 3 states",
+        lambda: km.RandomFourier(1, 1.0, frequencies=[[1.0]], phases=[0.0], bound=NAMES)),
     (DATA, r"RandomFourier does not know its states yet", lambda: km.RandomFourier(1, 1.0)([1.0])),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("error", "text", "mistake"), MISTAKES, ids=[text for _, text, _ in MISTAKES])

@@ -3,10 +3,13 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import koopmpc as km
@@ -29,9 +32,9 @@ def drawn(path: Path, draw: Callable, X: Sequence = (0.0,), plans: np.ndarray | 
     return Logged(path)
 
 
-def strips(log: Logged, entity: str) -> list[np.ndarray]:
-    """Return the strips of the first row of an entity, y up."""
-    return [np.array(strip) * (1, -1) for strip in log.rows(entity, "strips")[1][0]]
+def strips(log: Logged, entity: str, row: int = 0) -> list[np.ndarray]:
+    """Return the strips of a row of an entity, y up."""
+    return [np.array(strip) * (1, -1) for strip in log.rows(entity, "strips")[1][row]]
 
 
 def ranges(path: Path) -> np.ndarray:
@@ -48,16 +51,21 @@ def ranges(path: Path) -> np.ndarray:
     raise AssertionError("the animation has no ranges")
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_a_box_is_covered_and_no_more(seed: int, tmp_path: Path) -> None:
-    rng = np.random.default_rng(seed)
-    (x, y, angle), size = rng.uniform(-4, 4, 3), rng.uniform(0.1, 3, 2)
-    log = drawn(tmp_path / "run.rrd", lambda _: [km.scene.Box("box", (x, y), tuple(size), angle)])
-    (path,) = strips(log, "world/box")
+coordinate, length = st.floats(-10, 10), st.floats(0.1, 3)
+BOXES = st.lists(st.tuples(coordinate, coordinate, length, length, st.floats(-4, 4)), min_size=1, max_size=5)
+
+
+@given(boxes=BOXES, k=st.integers(0, 4))
+def test_a_box_is_covered_and_no_more(boxes: list[tuple[float, ...]], k: int, tmp_path_factory: Any) -> None:
+    k, path = min(k, len(boxes) - 1), tmp_path_factory.mktemp("box") / "run.rrd"
+    x, y, width, height, angle = boxes[k]
+    shapes = [km.scene.Box("box", box[:2], box[2:4], box[4]) for box in boxes]
+    path = strips(drawn(path, lambda x: [shapes[int(x)]], range(len(boxes))), "world/box", k)[0]
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    local, r = (path - (x, y)) @ turn, min(size) / 8
+    size, r = np.array([width, height]), min(width, height) / 8
+    local = (path - (x, y)) @ turn
     np.testing.assert_allclose(np.abs(local).max(axis=0) + r, size / 2, atol=1e-4)
-    inside = rng.uniform(-0.5, 0.5, (50, 2)) * (size - 2 * r)
+    inside = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2)) * (size - 2 * r)
     assert max(distance(point, local) for point in inside) <= r + 1e-4
 
 
@@ -103,10 +111,12 @@ def test_only_what_moves_is_drawn_ahead_and_fades(tmp_path: Path) -> None:
     assert 0 < near < far < 247
 
 
-@pytest.mark.parametrize("horizon", [1, 2, 3, 4, 5, 50, 199])
-def test_the_last_stage_is_always_among_those_drawn(horizon: int, tmp_path: Path) -> None:
+@given(horizon=st.integers(1, 200))
+def test_the_last_stage_is_always_among_those_drawn(horizon: int, tmp_path_factory: Any) -> None:
     plan = np.arange(horizon + 1.0)[None]
-    log = drawn(tmp_path / "run.rrd", lambda x: [km.scene.Disk("d", (x, 0.0), 0.1)], plans=plan)
+    log = drawn(
+        tmp_path_factory.mktemp("stages") / "run.rrd", lambda x: [km.scene.Disk("d", (x, 0.0), 0.1)], plans=plan
+    )
     stages = [round(strip[:, 0].mean()) for strip in strips(log, "world/prediction/d")]
     assert stages[0] == horizon
     assert stages == sorted(set(stages), reverse=True)
