@@ -78,6 +78,19 @@ def fit(place, *arguments):
     return folder, result.stdout
 
 
+@pytest.fixture
+def made(monkeypatch):
+    """What the steps of a fit return to it, by name: the parts of the data, and the models that are chosen."""
+    found, room = {}, importlib.import_module("koopmpc.apps.fitting.fit")
+
+    def kept(name, step):
+        return lambda *given, **how: found.setdefault(name, step(*given, **how))
+
+    for name in ("read_logs", "select"):
+        monkeypatch.setattr(room, name, kept(name, getattr(room, name)))
+    return found
+
+
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
     """Return the folder of one call without any option, what it printed, and fresh data of the same plant."""
@@ -139,26 +152,30 @@ def test_the_model_is_read_in_a_process_that_never_saw_its_lifting(fitted):
 
 
 @pytest.mark.usefixtures("quick")
-def test_the_report_is_of_episodes_that_no_fit_saw(tmp_path):
-    rng, made = np.random.default_rng(0), []
+def test_the_report_is_of_episodes_that_no_fit_saw(tmp_path, made):
+    rng, episodes = np.random.default_rng(0), []
     for _ in range(20):
         X, U = [rng.uniform(-1, 1, 2)], rng.uniform(-1, 1, (80, 1))
         for (u,) in U:
             a, b = X[-1]
             X.append(np.array([0.9 * a + 0.1 * b, 0.9 * b - 0.1 * a + 0.4 * u * a + 0.1 * u]))
-        made.append(km.Episode(X=X, U=U))
-    data = km.Episodes(made, 0.1)
+        episodes.append(km.Episode(X=X, U=U))
+    data = km.Episodes(episodes, 0.1)
     data.save(tmp_path / "data.npz")
     folder, said = fit(tmp_path, tmp_path / "data.npz", "--horizon", "10")
     assert "held out  6 episodes" in said
-    assert km.load_model(folder / "model.npz").report.samples == 14 * 80
-    assert isinstance(km.load_model(folder / "linear.npz"), km.LinearPredictor)
+    held = {e.X.tobytes() for e in made["read_logs"].held_out}
+    assert len(held) == 6
+    assert held < {e.X.tobytes() for e in data}
+    assert km.load_model(folder / "model.npz") == made["select"].predictor
+    assert km.load_model(folder / "linear.npz") == made["select"].linear
+    assert made["select"].predictor.report.samples == 14 * 80
     assert "What could not be made" not in (folder / "report.md").read_text()
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-def test_what_memory_does_not_hold_is_fitted_part_by_part_on_processes(tmp_path, monkeypatch):
+def test_what_memory_does_not_hold_is_fitted_part_by_part_on_processes(tmp_path, monkeypatch, made):
     monkeypatch.setattr("koopmpc.data.files.folder._PART", 1)
     data = cart_pole(24)
     for i in range(12):
@@ -166,21 +183,29 @@ def test_what_memory_does_not_hold_is_fitted_part_by_part_on_processes(tmp_path,
     monkeypatch.setattr("koopmpc.apps.fitting.logs.IN_MEMORY", 1000)
     folder, said = fit(tmp_path, tmp_path / "in", "--horizon", "10", "--workers", "2", "--linear")
     assert "read in 12 parts: 1 of them is held out" in said
-    assert km.load_model(folder / "model.npz").report.samples == 22 * 40
+    model, best = km.load_model(folder / "model.npz"), made["select"].best
+    assert model.report.samples == 22 * 40
+    held = {e.X.tobytes() for e in made["read_logs"].held_out}
+    rest = data.with_episodes([e for e in data if e.X.tobytes() not in held])
+    assert len(rest) == 22
+    again = km.edmd(rest, best.lifting, ridge=best.ridge, towards="affine")
+    assert pytest.approx(again.A, abs=1e-6) == model.A
 
 
 @pytest.mark.usefixtures("quick")
-def test_the_end_of_one_long_log_is_held_out_and_that_is_said(tmp_path):
+def test_the_end_of_one_long_log_is_held_out_and_that_is_said(tmp_path, made):
     data = cart_pole(1, steps=500)
     write_csv(data, tmp_path / "csv")
     _, said = fit(tmp_path, tmp_path / "csv" / "00.csv", "--horizon", "10", "--linear")
     assert re.search(r"the last fifth of the record is held out, in \d+ blocks", said)
+    assert len(made["read_logs"].held_out) >= 4
+    assert np.allclose(np.concatenate([e.X[:-1] for e in made["read_logs"].held_out]), data[0].X[400:-1])
 
 
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("memory", tiers.few([10**9, 1000], 1000))
 def test_columns_that_say_nothing_are_left_out_and_wrapped_angles_unwrapped_and_that_is_said(
-    tmp_path, monkeypatch, memory
+    tmp_path, monkeypatch, memory, made
 ):
     monkeypatch.setattr("koopmpc.data.files.folder._PART", 1)
     for i, e in enumerate(cart_pole(24)):
@@ -198,6 +223,7 @@ def test_columns_that_say_nothing_are_left_out_and_wrapped_angles_unwrapped_and_
     assert re.search(r"! theta jumped by 2π \d+ times and was unwrapped", said)
     model = km.load_model(folder / "model.npz")
     assert (model.states, model.inputs) == (("x", "v", "omega", "theta"), ("force",))
+    assert max(np.abs(np.diff(e.X[:, 3])).max() for e in made["read_logs"].held_out) < 1.0
 
 
 @pytest.mark.usefixtures("quick")
@@ -309,19 +335,20 @@ def test_what_files_have_in_common_is_said_once_and_no_column_of_one_file_is_jud
 
 
 @pytest.mark.usefixtures("quick")
-def test_logs_are_audited_and_what_is_safe_is_done_and_said(tmp_path):
+def test_logs_are_audited_and_what_is_safe_is_done_and_said(tmp_path, made):
     """Spikes are left out, a late input widens the past that models may see, and a clock that jitters is evened."""
-    made, data = [], cart_pole(20, steps=80)
+    episodes, data = [], cart_pole(20, steps=80)
     for e in data:
         X, U = e.X[:-3].copy(), e.U[3:]  # the force acts three steps late
         X[30, 1] += 40
-        made.append(km.Episode(X=X, U=U))
+        episodes.append(km.Episode(X=X, U=U))
     (tmp_path / "in").mkdir()
-    data.with_episodes(made).save(tmp_path / "in" / "late.npz")
+    data.with_episodes(episodes).save(tmp_path / "in" / "late.npz")
     _, said = fit(tmp_path, tmp_path / "in", "--horizon", "10", "--linear")
     assert re.search(r"! spikes: theta leaves its path and returns, 20 times: .*these rows were left out", said, re.S)
     assert re.search(r"! input delay: force acts 3 steps late; models that see 3 steps of the past are", said)
-    assert float(re.search(r"theta +\S+ … (\S+)", said)[1]) < 20
+    assert max(np.abs(e.X[:, 1]).max() for e in made["read_logs"].held_out) < 20
+    assert made["read_logs"].delay == 3
 
 
 @pytest.mark.usefixtures("quick")
