@@ -227,7 +227,6 @@ def _derive_condensed(tables: Tables, program: CondensedProgram, room: int) -> N
         "QP_M": m,
         "QP_M1": max(1, m),
         "QP_SOFT": int(soft.sum()),
-        "QP_MIXED": int(soft.any() and not soft.all()),
         "STEEP": int(program.solver.metric is not None and program.levels is None),
     }
     _add_memory(sizes, "QP", [(moves, m, sizes["QP_SOFT"])])

@@ -70,7 +70,7 @@ def write_unit(tables: Tables, texts: dict[str, str], path: Path, name: str, ver
     code = join_sources(texts)
     parts = [code, read_shipped("c", "unit.c"), read_shipped("c", f"fmi{version}.c")]
     token = fingerprint("".join(parts).encode())[:32]
-    parts.insert(1, f'#define KOOPMPC_TOKEN "{token}"\n')
+    parts.insert(1, f'#define KOOPMPC_TOKEN "{token}"\n#define FMI(name) fmi{version}##name\n')
     source = rename_symbols({"all": "\n".join(parts)}, name)["all"]
     files = {"modelDescription.xml": _describe(tables, name, token, version).encode()}
     files[f"sources/{name}.c"] = source.encode()

