@@ -101,38 +101,24 @@ _TWO_HIDDEN = LoggedTask(
 )
 
 _MORE = (
-    Task(
+    replace(
+        TASKS["sine"],
         name="short preview",  # the beam follows a sine of which it sees a sixth of a period
-        truth=plants.Wells(),
-        dt=0.1,
-        around=([0.0, 0.0], [0.0]),
-        training=km.Training(
-            x0=km.Uniform([-1.8, -2.0], [1.8, 2.0]), excitation=km.Noise(-3.0, 3.0, hold=3), episodes=50, steps=50
-        ),
         Q=[5.0, 0.01],
         R=[0.1],
         limits=km.Limits(u_min=-4.0, u_max=4.0),
         horizon=10,
         reference=_sine(1.0, 60.0, 150, 0),
-        starts=[[0.5, 0.0]],
-        steps=150,
     ),
-    Task(
+    replace(
+        TASKS["beyond"],
         name="preview beyond",  # the rate of an oscillator follows a sine past its limit, seen a sixth of a period
-        truth=plants.VanDerPol(),
-        dt=0.1,
-        around=([0.0, 0.0], [0.0]),
-        training=km.Training(
-            x0=km.Uniform([-2.0, -2.0], [2.0, 2.0]), excitation=km.Noise(-3.0, 3.0, hold=3), episodes=50, steps=50
-        ),
         Q=[0.1, 10.0],
-        R=[0.1],
         limits=km.Limits(u_min=-4.0, u_max=4.0, x_min=[-np.inf, -0.8], x_max=[np.inf, 0.8]),
         horizon=10,
         reference=_sine(1.0, 60.0, 150, 1),
         starts=[[0.5, 0.0]],
         steps=150,
-        u_target="zero",
     ),
     Task(
         name="cliff",  # a tank is filled across a ledge, above which it is four times as wide
@@ -203,26 +189,13 @@ _MORE = (
         starts=[[-1.5, 0.0]],
         steps=100,
     ),
-    Task(
+    replace(
+        TASKS["two inputs"],
         name="leaks",  # four tanks with other outlets than in the logs and a leak in two of them, measured exactly
         truth=more_plants.LeakyTanks(a1=0.0781, a2=0.0513),
         model=plants.Tanks(),
-        dt=5.0,
-        around=([12.4, 12.7, 1.8, 1.4], [3.0, 3.0]),
-        training=km.Training(
-            x0=km.Uniform([6.0, 6.0, 0.5, 0.5], [18.0, 18.0, 4.0, 4.0]),
-            excitation=km.Noise([1.0, 1.0], [5.0, 5.0], hold=4),
-            episodes=40,
-            steps=50,
-        ),
-        Q=[1.0, 1.0],
-        R=[0.1, 0.1],
-        limits=km.Limits(u_min=0.5, u_max=6.0, x_min=[4.0, 4.0, 0.2, 0.2], x_max=[18.0, 18.0, 5.0, 5.0]),
-        horizon=20,
-        tracked=["h1 [cm]", "h2 [cm]"],
         reference=np.array([12.0, 13.0]),
         starts=[[8.0, 15.0, 1.5, 1.5]],
-        steps=100,
     ),
     Task(
         name="turning gain",  # a reactor with two inputs comes near to the most that it can make of B

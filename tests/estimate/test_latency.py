@@ -43,34 +43,24 @@ def test_it_is_the_optimum_of_the_delayed_plant(bound, nx, nu, seed):
         x, acting = A @ x + B @ acting, u
 
 
+def run_late(plant, mpc, x0, r, steps, limits, **options):
+    """Return a run in which each input acts a step late."""
+    how = km.loop.LoopOptions(faults=LATE, **options)
+    return km.simulate(plant, mpc, x0=x0, reference=[r, 0], steps=steps, limits=limits, options=how)
+
+
 @pytest.mark.parametrize("estimator", [None, km.LiftedDisturbance(), km.LiftedKalman(("x0", "x1"))])
 def test_on_a_true_model_the_plan_is_what_happens(estimator):
     """The loop that applies u a step late meets the plan of the second step to the end."""
     model = linear(np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]]), [0.0, 0.0])
     cost, limits = km.Cost([1.0, 0.1], 0.1), km.Limits(-2, 2)
     mpc = km.KoopmanMPC(model, cost, limits, 20, latency=1, estimator=estimator, settings=PRECISE)
-    run = km.simulate(
-        model.step_map(),
-        mpc,
-        x0=[1, 0],
-        reference=[0, 0],
-        steps=80,
-        limits=limits,
-        options=km.loop.LoopOptions(faults=LATE, plans=True),
-    )
+    run = run_late(model.step_map(), mpc, [1, 0], 0, 80, limits, plans=True)
     for k in (0, 3, 10):
         np.testing.assert_allclose(run.plans.X[k][:2], run.X[k + 1 : k + 3], atol=1e-6)
     np.testing.assert_allclose(run.X[-1], 0, atol=1e-3)
     ignorant = km.KoopmanMPC(model, cost, limits, 20)
-    other = km.simulate(
-        model.step_map(),
-        ignorant,
-        x0=[1, 0],
-        reference=[0, 0],
-        steps=80,
-        limits=limits,
-        options=km.loop.LoopOptions(faults=LATE),
-    )
+    other = run_late(model.step_map(), ignorant, [1, 0], 0, 80, limits)
     assert _cost(run) < _cost(other)
 
 
@@ -94,15 +84,7 @@ def test_offset_free_with_latency():
     model = linear(A, B, [0.0, 0.0])
     for estimator in (km.LiftedDisturbance(), km.LiftedKalman(("x0", "x1"))):
         mpc = km.KoopmanMPC(model, km.Cost([1, 0], 0.1), km.Limits(-5, 5), 15, latency=1, estimator=estimator)
-        run = km.simulate(
-            true,
-            mpc,
-            x0=[0, 0],
-            reference=[0.7, 0],
-            steps=150,
-            limits=km.Limits(-5, 5),
-            options=km.loop.LoopOptions(faults=LATE),
-        )
+        run = run_late(true, mpc, [0, 0], 0.7, 150, km.Limits(-5, 5))
         assert abs(run.X[-1, 0] - 0.7) < 1e-6
 
 

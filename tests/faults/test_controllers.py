@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from tests.example_plants import Swing
+from tests.loop.test_faults import Recorded
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
 BOX = km.Limits(u_min=-3.0, u_max=5.0)
@@ -55,32 +56,6 @@ def _daqp():
     return True
 
 
-class Watched:
-    """A controller that keeps what it was told to have been applied, and what it answered."""
-
-    def __init__(self, controller):
-        self.controller, self.told, self.given = controller, [], []
-        self.dt, self.nu, self.horizon = controller.dt, controller.nu, controller.horizon
-
-    def reset(self, x0=None, u_prev=None):
-        self.controller.reset(x0, u_prev)
-
-    @property
-    def solver_fails(self):
-        return getattr(self.controller, "solver_fails", False)
-
-    @solver_fails.setter
-    def solver_fails(self, value):
-        if hasattr(self.controller, "solver_fails"):
-            self.controller.solver_fails = value
-
-    def __call__(self, y, reference, applied=None):
-        move = self.controller(y, reference, applied)
-        self.told.append(np.zeros(self.nu) if applied is None else np.array(applied))
-        self.given.append(move.u.copy())
-        return move
-
-
 STEPS = 8
 SHARE = st.floats(0.0, 1.0)
 WINDOW = st.tuples(st.integers(0, 5), st.none() | st.integers(1, 5)).map(
@@ -124,10 +99,11 @@ def test_none_raises_or_leaves_its_limits_and_runs_repeat(controllers, name, wha
     faults = [kind(*arguments, **window) for kind, arguments, window in data.draw(SETS[what])]
     seed = data.draw(st.integers(0, 2**31))
     x0 = data.draw(st.tuples(st.floats(-3.0, 3.0), st.floats(-4.0, 4.0)))
-    watched = Watched(controller)
+    watched = Recorded(controller)
     run = run_of(watched, limits, faults, seed, x0)
     low, high = limits.inputs(1)
-    given, told = np.array(watched.given), np.array(watched.told)
+    given = np.array([move.u for move in watched.moves])
+    told = np.array([np.zeros(controller.nu) if applied is None else applied for applied in watched.told])
     for u in (given, run.U):
         assert np.isfinite(u).all()
         assert ((low <= u) & (u <= high)).all()
@@ -140,5 +116,5 @@ def test_none_raises_or_leaves_its_limits_and_runs_repeat(controllers, name, wha
     assert sum(figures.fallback.values()) == sum(figures.status.values()) == STEPS
     for status, fallback in zip(run.status, run.fallback, strict=True):
         assert (fallback is km.control.Fallback.NONE) == (status in GOOD)
-    again = run_of(Watched(controller), limits, faults, seed, x0)
+    again = run_of(Recorded(controller), limits, faults, seed, x0)
     assert replace(again, solve_time=run.solve_time) == run

@@ -143,16 +143,21 @@ def task_timings() -> Iterator[Timing | None]:
             yield time_loop("ten tasks", f"{task.name}, {kind}", made, calls[:200])
 
 
+def draw_model(rng: np.random.Generator, nx: int, nu: int, radius: float) -> km.LinearPredictor:
+    """Return a random model with this spectral radius."""
+    A, B = rng.normal(size=(nx, nx)), rng.normal(size=(nx, nu))
+    A *= radius / np.abs(np.linalg.eigvals(A)).max()
+    names = tuple(f"x{i}" for i in range(nx)), tuple(f"u{i}" for i in range(nu))
+    return km.LinearPredictor(A, B, np.eye(nx), km.State(), 0.1, *names)
+
+
 def size_timings(horizons: tuple[int, ...]) -> Iterator[Timing | None]:
     """Time loops with long horizons, up to four inputs, and limits of different structure."""
     rng = np.random.default_rng(0)
     nx = 8
     for N, nu, radius, kind in product(horizons, (1, 4), (0.95, 1.05), ("inputs", "rates", "soft", "hard")):
         for far in (0.5, 4.0):
-            A, B = rng.normal(size=(nx, nx)), rng.normal(size=(nx, nu))
-            A *= radius / np.abs(np.linalg.eigvals(A)).max()
-            names = tuple(f"x{i}" for i in range(nx)), tuple(f"u{i}" for i in range(nu))
-            model = km.LinearPredictor(A, B, np.eye(nx), km.State(), 0.1, *names)
+            model = draw_model(rng, nx, nu, radius)
             end = np.full(nx, np.inf)
             end[:2] = 2.0
             more: dict[str, Any] = {
@@ -167,7 +172,7 @@ def size_timings(horizons: tuple[int, ...]) -> Iterator[Timing | None]:
             mpc, x = Recorded(made["daqp"], calls), far * rng.normal(size=nx)
             begin = time.thread_time()
             for _ in range(20):
-                x = A @ x + B @ mpc(x, np.zeros(nx)).u + 0.05 * far * rng.normal(size=nx)
+                x = model.A @ x + model.B @ mpc(x, np.zeros(nx)).u + 0.05 * far * rng.normal(size=nx)
                 if np.abs(x).max() > 1e3 or time.thread_time() - begin > 5.0:
                     break
             title = f"{kind}, radius {radius}, start {far}"
@@ -179,10 +184,7 @@ def saturated_timings(horizons: tuple[int, ...]) -> Iterator[Timing | None]:
     rng = np.random.default_rng(2)
     nx = 8
     for N, nu, room, kind in product(horizons, (1, 4), (0.3, 0.1, 0.02), ("inputs", "rates", "soft")):
-        A, B = rng.normal(size=(nx, nx)), rng.normal(size=(nx, nu))
-        A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
-        names = tuple(f"x{i}" for i in range(nx)), tuple(f"u{i}" for i in range(nu))
-        model = km.LinearPredictor(A, B, np.eye(nx), km.State(), 0.1, *names)
+        model = draw_model(rng, nx, nu, 0.9)
         end = np.full(nx, np.inf)
         end[:2] = 2.0
         more: dict[str, Any] = {
@@ -196,7 +198,7 @@ def saturated_timings(horizons: tuple[int, ...]) -> Iterator[Timing | None]:
         path = 0.15 * np.cumsum(rng.normal(size=(N + 20, nx)), axis=0)
         begin = time.thread_time()
         for k in range(20):
-            x = A @ x + B @ mpc(x, path[k : k + N + 1]).u + 0.05 * rng.normal(size=nx)
+            x = model.A @ x + model.B @ mpc(x, path[k : k + N + 1]).u + 0.05 * rng.normal(size=nx)
             if time.thread_time() - begin > 5.0:
                 break
         yield time_loop(f"saturated, {kind}, n {N * nu}", f"room {room}", made, calls)
