@@ -80,7 +80,7 @@ class RealTimeSolver(PlanSolver):
     ) -> None:
         self.iteration, self._problem, self._sqp_iterations = iteration, task.problem, sqp_iterations
         self._inputs = task.outputs.inputs
-        self._spent = 0  # effort of the solver in this step
+        self._iterations = self._spent = 0  # of the solver in this step, and their effort
         self._on_levels = None if levels is None else StageLevels(levels, rated=task.problem.with_rates)
         self.update(task.map)
 
@@ -103,54 +103,46 @@ class RealTimeSolver(PlanSolver):
 
     def solve(self, start: PlanStart) -> StagePlan:
         """Return the plan from a start: by linearisations of the last plan, or of several starts."""
-        iteration, self._spent, nx = self.iteration, 0, self._map.nx
+        iteration, nx = self.iteration, self._map.nx
+        self._iterations = self._spent = 0
         iteration.multipliers, iteration.e[:, :nx] = None, start.e
         if self._map.scheduled:
             iteration.W[:] = start.W
         if self._problem.with_rates:
             nu = len(start.u_prev)
             iteration.low[0, :nu], iteration.high[0, :nu] = start.first
-        status, iterations = Status.FAILED, 0
+        status = Status.FAILED
         jump = np.abs(start.s[:nx] - iteration.X[1, :nx]) / self._problem.sizes[:nx]  # from the state that was expected
         if start.warm and jump.max() <= EFFORT.far:
             self._shift(start)
-            status, iterations = self._improve(start, self._sqp_iterations)
-            if iteration.limits_outputs:
-                status, more = self._meet_limits(status, start)
-                iterations += more
+            status = self._meet_limits(self._improve(start, self._sqp_iterations), start)
         if status not in GOOD and status is not Status.TIME_LIMIT:  # there is no plan, or it has lost the plant
-            status, more = self._begin_anew(start)
-            iterations += more
-            if iteration.limits_outputs:
-                status, more = self._meet_limits(status, start)
-                iterations += more
+            status = self._meet_limits(self._begin_anew(start), start)
         if self._problem.ends and status in GOOD:
-            status, more = self._meet_end(status, start)
-            iterations += more
+            status = self._meet_end(status, start)
         if self._on_levels is not None and status in GOOD and not self._rests_on_levels(start.box):
-            status, more = self._put_on_levels(self._on_levels, start)
-            iterations += more
+            status = self._put_on_levels(self._on_levels, start)
         free = iteration.without_limits + (start.u_prev if self._problem.with_rates else 0.0)
-        return StagePlan(iteration.X, iteration.U, status, iterations, iteration.slack, free)
+        return StagePlan(iteration.X, iteration.U, status, self._iterations, iteration.slack, free)
 
     def _rests_on_levels(self, box: Interval) -> bool:
         """Return whether the plan is on levels although it was found without them."""
         U = self._problem.leave(self.iteration.X, self.iteration.U, box)[1]
         return self._on_levels is not None and self._on_levels.search.accepts(U[self._problem.free].ravel())
 
-    def _put_on_levels(self, levels: StageLevels, start: PlanStart) -> tuple[Status, int]:
-        """Put the plan on levels; return how that ended, and the solver's iterations.
+    def _put_on_levels(self, levels: StageLevels, start: PlanStart) -> Status:
+        """Put the plan on levels; return how that ended.
 
         Each pass linearises at the plan of the last one, and they end where the levels stay.
         """
-        iteration, search, total, kept, broken = self.iteration, levels.search, 0, None, 0.0
+        iteration, search, kept, broken = self.iteration, levels.search, None, 0.0
         for _ in range(EFFORT.passes):
             found = iteration.step(start.s, start.targets, start.deadline, levels)
-            total += found.iterations
+            self._iterations += found.iterations
             if found.status is not Status.OPTIMAL:
                 search.repeats = False
                 if kept is None:
-                    return found.status, total
+                    return found.status
                 search.index, search.gap = kept
                 break
             same = kept is not None and bool((kept[0] == search.index).all())
@@ -163,52 +155,50 @@ class RealTimeSolver(PlanSolver):
                 break
             search.repeats = True
         search.repeats = False
-        return Status.SOFTENED if broken else Status.OPTIMAL, total
+        return Status.SOFTENED if broken else Status.OPTIMAL
 
-    def _meet_limits(self, status: Status, start: PlanStart) -> tuple[Status, int]:
-        """Linearise on until the plan keeps its hard limits; return how it ended, and the solver's iterations."""
-        iteration, total = self.iteration, 0
+    def _meet_limits(self, status: Status, start: PlanStart) -> Status:
+        """Linearise on until the plan keeps its hard limits; return how it ended."""
+        iteration = self.iteration
+        if not iteration.limits_outputs:
+            return status
         for _ in range(EFFORT.endings):
             if status not in GOOD or iteration.excess() <= 1 or perf_counter() > start.deadline:
-                return status, total
-            status, more = self._improve(start, 1)
-            total += more
-        return (status if status not in GOOD or iteration.excess() <= 1 else Status.MAX_ITERATIONS), total
+                return status
+            status = self._improve(start, 1)
+        return status if status not in GOOD or iteration.excess() <= 1 else Status.MAX_ITERATIONS
 
-    def _meet_end(self, status: Status, start: PlanStart) -> tuple[Status, int]:
-        """Linearise on until the plan ends in its terminal set; return how it ended, and the solver's iterations."""
-        iteration, total, before = self.iteration, 0, np.inf
+    def _meet_end(self, status: Status, start: PlanStart) -> Status:
+        """Linearise on until the plan ends in its terminal set; return how it ended."""
+        iteration, before = self.iteration, np.inf
         hard = bool(np.isinf(self._problem.softness.linear[-1]))
         for _ in range(EFFORT.endings):
             excess = iteration.end_excess()
             if excess <= EFFORT.met or (not hard and excess >= 0.9 * before) or perf_counter() > start.deadline:
                 break
             before = excess
-            ended, more = self._improve(start, 1)
-            total += more
-            if ended not in GOOD:
-                return ended, total
-            status = ended
+            status = self._improve(start, 1)
+            if status not in GOOD:
+                return status
         excess = iteration.end_excess()
         if hard and excess > EFFORT.met:
-            return Status.TIME_LIMIT if perf_counter() > start.deadline else Status.INFEASIBLE, total
+            return Status.TIME_LIMIT if perf_counter() > start.deadline else Status.INFEASIBLE
         if excess > SOFTENED:
             iteration.slack = max(iteration.slack, excess)
-            return Status.SOFTENED, total
-        return status, total
+            return Status.SOFTENED
+        return status
 
-    def _begin_anew(self, start: PlanStart) -> tuple[Status, int]:
-        """Take the cheapest of the plans to which several starts lead; return how it ended, and all iterations.
+    def _begin_anew(self, start: PlanStart) -> Status:
+        """Take the cheapest of the plans to which several starts lead; return how it ended.
 
         Plans that follow the model come before those that do not yet. After an effort of `spent` no further
         linearisation begins, and no further start. None does either where the problem is affine and a plan was found:
         all starts lead to that one.
         """
-        iteration, total, best, done, until = self.iteration, 0, (3, 0.0), False, self._spent + EFFORT.spent
+        iteration, best, done, until = self.iteration, (3, 0.0), False, self._spent + EFFORT.spent
         status, kept = Status.FAILED, (iteration.X.copy(), iteration.U.copy(), 0.0)
         for X, U in self._starts(start):
-            ended, iterations = self._improve(start, EFFORT.each, EFFORT.nearly, (X, U), until)
-            total += iterations
+            ended = self._improve(start, EFFORT.each, EFFORT.nearly, (X, U), until)
             rank = (2, 0.0)
             if ended in GOOD:
                 gap = iteration.gap
@@ -222,13 +212,12 @@ class RealTimeSolver(PlanSolver):
                 break
         iteration.X[:], iteration.U[:], iteration.slack = kept
         if status not in GOOD or done or perf_counter() > start.deadline:
-            return status, total
-        most = max(EFFORT.first, self._sqp_iterations)
-        polished, iterations = self._improve(start, most, until=until)
-        if polished not in GOOD:
-            iteration.X[:], iteration.U[:], iteration.slack = kept
-            polished = status
-        return polished, total + iterations
+            return status
+        polished = self._improve(start, max(EFFORT.first, self._sqp_iterations), until=until)
+        if polished in GOOD:
+            return polished
+        iteration.X[:], iteration.U[:], iteration.slack = kept
+        return status
 
     def _starts(self, start: PlanStart) -> Iterator[tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]]]:
         """Yield states and inputs to start from: rest at x, the line from x to the equilibrium, the motion from x.
@@ -256,33 +245,33 @@ class RealTimeSolver(PlanSolver):
         settled: float = SETTLED,
         begin: tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]] | None = None,
         until: float = np.inf,
-    ) -> tuple[Status, int]:
-        """Return how the last of at most this many iterations ended, and the solver's iterations of all.
+    ) -> Status:
+        """Return how the last of at most this many iterations ended.
 
         The first one begins at the states and inputs `begin`, by default at the plan. They end early where no more than
         a share `settled` of the plan moves, where F is nowhere near its linearisation, and at the deadline; then the
         plan found so far is used, and the step is late.
         """
-        total, status, iteration, until = 0, Status.FAILED, self.iteration, min(self._spent + EFFORT.spent, until)
+        status, iteration, until = Status.FAILED, self.iteration, min(self._spent + EFFORT.spent, until)
         if begin is not None:
             self._enter(*begin, start)
         for k in range(most):
             if k and (self._spent >= until or perf_counter() > start.deadline):
                 break
             found = iteration.step(start.s, start.targets, start.deadline)
-            total += found.iterations
+            self._iterations += found.iterations
             self._spent += found.effort
             if found.status not in GOOD:
-                return (status, total) if k and found.status is Status.TIME_LIMIT else (found.status, total)
+                return status if k and found.status is Status.TIME_LIMIT else found.status
             iteration.take(start.s, found)
             if iteration.length == 0.0:
-                return (found.status if iteration.gap < NEAR else Status.FAILED), total
+                return found.status if iteration.gap < NEAR else Status.FAILED
             self._enter(*self._problem.leave(iteration.X, iteration.U, start.box), start)
             status = Status.SOFTENED if iteration.slack else found.status
             whole = self._problem.affine and iteration.length == 1.0  # then the plan solves the problem itself
             if k + 1 < most and (whole or iteration.rests(found, settled)):
                 break
-        return status, total
+        return status
 
     def _enter(self, X: Float[np.ndarray, "N1 nx"], U: Float[np.ndarray, "N nu"], start: PlanStart) -> None:
         """Make these states and inputs the plan."""
