@@ -2,7 +2,7 @@
 
 import copy
 from time import perf_counter
-from typing import Any, TypeVar
+from typing import Any
 
 from numpy.typing import ArrayLike
 
@@ -12,14 +12,12 @@ from koopmpc.base.values import Value
 from koopmpc.control.move import Move, Token
 from koopmpc.control.plan.task import MoveBlocks
 from koopmpc.control.plan.tracking import Tracking
-from koopmpc.control.program import Published, SavedController
+from koopmpc.control.program import Published, Restored, SavedController
 from koopmpc.control.step.observe import InitialCondition
 from koopmpc.control.watching import StepWatch
 from koopmpc.estimate.observer import Estimator, StateObserver
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.plants.step_map import StepMap
-
-_Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
 
 
 class PredictiveController(Published):
@@ -122,7 +120,7 @@ class PredictiveController(Published):
         raise NotImplementedError
 
     @classmethod
-    def from_data(cls: type[_Restored], saved: SavedController) -> _Restored:
+    def from_data(cls: type[Restored], saved: SavedController) -> Restored:
         """Return the controller that is made of these data."""
         build: Any = cls
         return build(

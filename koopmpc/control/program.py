@@ -28,7 +28,7 @@ from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap
 
-_Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
+Restored = TypeVar("Restored")  # a class of controller that is made again of its data
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +217,8 @@ def _describe_limits(limits: Any, states: Sequence[str], inputs: Sequence[str]) 
 class Published:
     """A controller that is saved as data, and whose step may be published as a `Program`.
 
-    A subclass says in `as_data` and `from_data` how it is saved, and in `build_program` what a step needs.
+    A subclass says in `as_data` how it is saved, in `from_data` how it is made again if it takes more than a model, a
+    cost, limits and options, and in `build_program` what a step needs.
     """
 
     def as_data(self) -> SavedController:
@@ -231,9 +232,10 @@ class Published:
         raise NotImplementedError
 
     @classmethod
-    def from_data(cls: type[_Restored], saved: SavedController) -> _Restored:
+    def from_data(cls: type[Restored], saved: SavedController) -> Restored:
         """Return the controller that is made of these data."""
-        raise NotImplementedError
+        build: Any = cls
+        return build(saved.model, saved.cost, saved.limits, **saved.options)
 
     def __repr__(self) -> str:
         """Return the class, its model, horizon, cost and limits in words."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from time import perf_counter
-from typing import Any, TypeVar
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,14 +17,12 @@ from koopmpc.control.ask.cost import Cost, check_cost_and_limits, refuse_stage, 
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.move import Move, alone
-from koopmpc.control.program import SavedController
+from koopmpc.control.program import Restored, SavedController
 from koopmpc.control.step.feedback import FeedbackLaw
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Eigenfunction
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Buffered
-
-_Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
 
 
 class EigenfunctionLQR(FeedbackLaw):
@@ -134,7 +132,7 @@ class EigenfunctionLQR(FeedbackLaw):
         return SavedController("EigenfunctionLQR", None, self.cost, self.limits, options=options)
 
     @classmethod
-    def from_data(cls: type[_Restored], saved: SavedController) -> _Restored:
+    def from_data(cls: type[Restored], saved: SavedController) -> Restored:
         """Return the controller that is made of these data."""
         options = dict(saved.options)
         graph = options["B"]

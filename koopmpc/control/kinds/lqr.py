@@ -1,7 +1,6 @@
 """LQR, u = −K ψ(x) + feedforward inside limits; the gains `lqr` and `dlqr`."""
 
 from time import perf_counter
-from typing import Any, TypeVar
 
 import numpy as np
 import scipy.linalg
@@ -18,19 +17,13 @@ from koopmpc.control.horizon import horizon_of
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.move import Move, alone
 from koopmpc.control.plan.tracking import lifted_tracking
-from koopmpc.control.program import (
-    SavedController,
-    no_export,
-    reference_table,
-)
+from koopmpc.control.program import SavedController, no_export, reference_table
 from koopmpc.control.riccati import Gain
 from koopmpc.control.step.feedback import FeedbackLaw, FeedbackProgram
 from koopmpc.control.target import Units, targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.estimate.observer import Measured
 from koopmpc.models.predictors import LinearPredictor
-
-_Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
 
 
 class LQR(FeedbackLaw):
@@ -99,12 +92,6 @@ class LQR(FeedbackLaw):
     def as_data(self) -> SavedController:
         """Return what the controller was made of."""
         return SavedController("LQR", self.predictor, self.cost, self.limits)
-
-    @classmethod
-    def from_data(cls: type[_Restored], saved: SavedController) -> _Restored:
-        """Return the controller that is made of these data."""
-        build: Any = cls
-        return build(saved.model, saved.cost, saved.limits, **saved.options)
 
     def build_program(self, reference: ArrayLike | None) -> FeedbackProgram:
         """Return the data of a step."""

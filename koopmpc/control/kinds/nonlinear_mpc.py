@@ -1,7 +1,7 @@
 """NonlinearMPC: multiple shooting and a nonlinear program a step; the oracle that others are measured against."""
 
 from dataclasses import fields, replace
-from typing import Any, TypeVar
+from typing import Any
 
 from numpy.typing import ArrayLike
 
@@ -15,13 +15,11 @@ from koopmpc.control.nonlinear.staged_mpc import StagedMPC
 from koopmpc.control.nonlinear.stages import ModelOrMap
 from koopmpc.control.nonlinear.task import StagedTask
 from koopmpc.control.plan.task import Moves
-from koopmpc.control.program import Program, SavedController, no_export
+from koopmpc.control.program import Program, Restored, SavedController, no_export
 from koopmpc.control.solvers.levels import LevelSearch
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator
-
-_Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
 
 
 class NonlinearMPC(StagedMPC):
@@ -109,7 +107,7 @@ class NonlinearMPC(StagedMPC):
         return "NonlinearMPC", self.model, {field.name: getattr(self._nlp, field.name) for field in fields(NLP)}
 
     @classmethod
-    def from_data(cls: type[_Restored], saved: SavedController) -> _Restored:
+    def from_data(cls: type[Restored], saved: SavedController) -> Restored:
         """Return the controller that is made of these data."""
         made: Any = super()
         return made.from_data(replace(saved, options={"solver": NLP(**saved.options)}))

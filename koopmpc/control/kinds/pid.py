@@ -7,7 +7,7 @@ and PID controller tuning", J. Process Control 13, 2003 (SIMC).
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,11 +22,10 @@ from koopmpc.control.ask.limits import Limits
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.move import Move, alone
 from koopmpc.control.plan.tracking import lifted_tracking
-from koopmpc.control.program import SavedController
+from koopmpc.control.program import Restored, SavedController
 from koopmpc.control.step.feedback import FeedbackLaw
 from koopmpc.models.predictors import LinearPredictor
 
-_Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
 _CIRCLE = 1e-9  # distance from the unit circle up to which a pole is on it
 
 
@@ -211,7 +210,7 @@ class PID(FeedbackLaw):
         return SavedController("PID", None, limits=self.limits, options=options)
 
     @classmethod
-    def from_data(cls: type[_Restored], saved: SavedController) -> _Restored:
+    def from_data(cls: type[Restored], saved: SavedController) -> Restored:
         """Return the controller that is made of these data."""
         build: Any = cls
         shape = {name: saved.options[name] for name in PIDOptions.__dataclass_fields__}

@@ -7,7 +7,6 @@ from time import perf_counter
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.base.checks import HUGE
 from koopmpc.base.values import Interval
 from koopmpc.control.ask.bounds import SOFTENED
 from koopmpc.control.move import Status
@@ -232,10 +231,8 @@ class RealTimeSolver(PlanSolver):
         yield rest + np.linspace(0.0, 1.0, N + 1)[:, None] * (start.rest - x), U
         if not isinstance(self._map.model, StepMap):
             return
-        motion = rest.copy()
-        for k in range(N):
-            motion[k + 1] = self._map.step(motion[k], u, start.W[k]) + start.e[k]
-        if np.abs(motion).max() < HUGE:
+        motion = self._map.roll_out(x, U, start.e, start.W)
+        if motion is not None:
             yield motion, U
 
     def _improve(

@@ -10,7 +10,6 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.base.checks import HUGE
 from koopmpc.base.values import Interval
 from koopmpc.control.ask.levels import HeldLevels, LevelBox
 from koopmpc.control.move import Status
@@ -165,10 +164,8 @@ class ShootingSolver(PlanSolver):
 
     def _roll_out(self, start: PlanStart, U: Float[np.ndarray, "N nu"]) -> list[Guess]:
         """Return the states to which U leads, and U; nothing where they overflow, or a step has no solution."""
-        X = [start.s[: self._map.nx]]
-        for u, e, w in zip(U, start.e, start.W, strict=True):
-            X.append(self._map.step(X[-1], u, w) + e)
-        return [(np.array(X), U)] if np.abs(X).max() < HUGE else []  # False for NaN
+        X = self._map.roll_out(start.s[: self._map.nx], U, start.e, start.W)
+        return [] if X is None else [(X, U)]
 
     def _list_begins(self, guesses: list[Guess], start: PlanStart) -> list[Begin]:
         stages = [self._problem.enter(X, U, start.u_prev, start.box) for X, U in guesses]

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from koopmpc.base import checks
+from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.values import Interval
@@ -115,6 +116,19 @@ class LearnedMap:
             return self._buffer(x, u, self.theta if w is None or not self.scheduled else self.schedule(w))[0]
         except RuntimeError:  # an implicit step does not converge, or CVODES gives up
             return np.full(len(x), np.nan)
+
+    def roll_out(
+        self,
+        x: Float[np.ndarray, " nx"],
+        U: Float[np.ndarray, "N nu"],
+        e: Float[np.ndarray, "N nx"],
+        W: Float[np.ndarray, "N nw"],
+    ) -> Float[np.ndarray, "N1 nx"] | None:
+        """Return the states to which U leads under e and w; None where they overflow, or a step has no solution."""
+        X = [x]
+        for u, moved, w in zip(U, e, W, strict=True):
+            X.append(self.step(X[-1], u, w) + moved)
+        return np.array(X) if np.abs(X).max() < HUGE else None  # False for NaN
 
     def slope(
         self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]
