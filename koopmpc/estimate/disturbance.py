@@ -14,7 +14,7 @@ from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.values import Value, Viewing
 from koopmpc.estimate.gate import BRIDGED, ROUNDING, gate_graph
-from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel
+from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel, find_undisturbed
 from koopmpc.estimate.periodic import PeriodicObserver, find_harmonics
 from koopmpc.models.predictors import LinearPredictor
 from koopmpc.plants.routines import bind_interpreter
@@ -145,14 +145,9 @@ class DisturbanceObserver(Viewing, Measured):
         own = self._model
         saturates = own.embedding is not None and own.embedding.rails is not None
         self._rails = own.embedding if saturates else None
-        known = slice(self.ny, None)
-        if isinstance(model, LinearPredictor):
-            constant = model.lifting.constant_index
-            known = slice(0, 0) if constant is None else slice(constant, constant + 1)
-        self._sizes = own.nz, own.nu, own.nw
-        self._known = np.isin(np.arange(own.nz), np.arange(own.nz)[known])
+        self._sizes, self._known = (own.nz, own.nu, own.nw), find_undisturbed(model)
         lift = None if self.lift is None else self.lift.function
-        self._rule = _rule(self._sizes, self.ny, known, (gain, reach), lift)
+        self._rule = _rule(self._sizes, self.ny, self._known, (gain, reach), lift)
         self._memory, self._C = np.zeros(self._rule.numel_in(2)), np.zeros(self.ny * own.nz)
         self._predicted, self._still = np.zeros(own.nz), np.zeros(own.nz)
         self._stood_in = False  # whether a prediction stood in for a part of the last reading
@@ -243,7 +238,11 @@ class DisturbanceObserver(Viewing, Measured):
 
 @raise_swallowed()
 def _rule(
-    sizes: tuple[int, int, int], nx: int, known: slice, speed: tuple[float, float], lift: ca.Function | None
+    sizes: tuple[int, int, int],
+    nx: int,
+    known: Bool[np.ndarray, " nz"],
+    speed: tuple[float, float],
+    lift: ca.Function | None,
 ) -> ca.Function:
     """Return (x, A z + B u + E w, memory, C, flags) → memory after x has come; z = ψ(x), or x itself without a `lift`.
 
@@ -259,9 +258,7 @@ def _rule(
     last, driven, m, d, f, rough, squares, change, learned, newest, seen = ca.vertsplit(memory, ends)
     z = x if lift is None else ca.SX(lift(x))
     good = ca.dot(z, z) < HUGE**2  # False for NaN
-    unknown = np.ones(nz)
-    unknown[known] = 0.0
-    e = ca.DM(unknown) * (z - predicted)
+    e = ca.DM(np.where(known, 0.0, 1.0)) * (z - predicted)
     learns = ca.logic_and(ca.logic_and(good, seen), ca.logic_and(flags[0], ca.dot(e, e) < HUGE**2))
     weight = ca.fmax(gain, newest)
     f_new, moved = C @ e, C @ (z - last)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
@@ -90,6 +90,12 @@ class LiftedModel:
             z_next += model.E.dot(w)
         z_next += d
         return z_next
+
+
+def find_undisturbed(model: LinearPredictor | StateModel) -> Bool[np.ndarray, " nz"]:
+    """Return which entries of z have no disturbance: the Constant, or the past of a state that is not lifted."""
+    entries = np.arange(model.nz)
+    return entries == model.lifting.constant_index if isinstance(model, LinearPredictor) else entries >= model.ny
 
 
 def state_model(model: LinearPredictor | StateModel) -> StateModel:
