@@ -114,9 +114,13 @@ class RealTimeSolver(PlanSolver):
         jump = np.abs(start.s[:nx] - iteration.X[1, :nx]) / self._problem.sizes[:nx]  # from the state that was expected
         if start.warm and jump.max() <= EFFORT.far:
             self._shift(start)
-            status = self._meet_limits(self._improve(start, self._sqp_iterations), start)
+            status = self._improve(start, self._sqp_iterations)
+            if iteration.limits_outputs:
+                status = self._meet_limits(status, start)
         if status not in GOOD and status is not Status.TIME_LIMIT:  # there is no plan, or it has lost the plant
-            status = self._meet_limits(self._begin_anew(start), start)
+            status = self._begin_anew(start)
+            if iteration.limits_outputs:
+                status = self._meet_limits(status, start)
         if self._problem.ends and status in GOOD:
             status = self._meet_end(status, start)
         if self._on_levels is not None and status in GOOD and not self._rests_on_levels(start.box):
@@ -159,8 +163,6 @@ class RealTimeSolver(PlanSolver):
     def _meet_limits(self, status: Status, start: PlanStart) -> Status:
         """Linearise on until the plan keeps its hard limits; return how it ended."""
         iteration = self.iteration
-        if not iteration.limits_outputs:
-            return status
         for _ in range(EFFORT.endings):
             if status not in GOOD or iteration.excess() <= 1 or perf_counter() > start.deadline:
                 return status
