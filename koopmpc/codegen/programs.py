@@ -286,6 +286,7 @@ def _derive_staged(tables: Tables, p: StagedProgram) -> None:
         "MADE": N + 1 if p.holds else 1,
         "MADE_SIZE": head + 1,
         "RESTS": aim.RESTS,
+        "REST_STEPS": aim.REST_STEPS,
         "MOST_TERMS": max(aim.ORDERS) + 1,
     }
     tables.arrays |= {"table": p.table.ravel(), "orders": np.array(aim.ORDERS, dtype=np.intc)}

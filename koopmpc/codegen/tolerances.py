@@ -51,6 +51,6 @@ IN_C = {
     "STILL": (aim.STILL, 1e-5),
     "TERMS": (aim.TERMS, 1e-5),
     "FLAT": (aim.ROUNDING, 1e-6),
-    "BURSTS": (aim.BURSTS, 1e3),
+    "LEFT": (aim.LEFT, 0.1),
     "SEEN": (aim.SEEN, 1e-3),
 }

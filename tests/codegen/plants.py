@@ -70,6 +70,14 @@ def make_thousandths():
 
 
 @cache
+def make_vehicle():
+    """Return a vehicle, which at rest cannot move sideways, of x, y and heading under speed and turn."""
+    x, u = ca.SX.sym("x", 3), ca.SX.sym("u", 2)
+    ahead = x + DT * ca.vertcat(u[0] * ca.cos(x[2]), u[0] * ca.sin(x[2]), u[1])
+    return km.StepMap(ca.Function("F", [x, u], [ahead]), DT)
+
+
+@cache
 def make_pair():
     """Return a linear model of two inputs, and equations in which one of them multiplies a state."""
     (A, B), x, u = PAIR, ca.SX.sym("x", 2), ca.SX.sym("u", 2)

@@ -293,6 +293,17 @@ def moving(more: Any = None, **options: Any) -> Callable[..., Case]:
     return make
 
 
+def drive(rng: Any) -> Case:
+    plant = plants.make_vehicle()
+    own = km.BilinearMPC(plant, km.Cost(Q=[10.0, 10.0, 1.0], R=0.1), km.Limits(-2.0, 2.0), 10)
+
+    def circle(k: int, count: int) -> Any:
+        angle = 0.5 * plants.DT * np.arange(k, k + count)
+        return np.column_stack([2 * np.sin(angle), 2 * (1 - np.cos(angle)), angle])
+
+    return Case(own, plant, circle, start=(0.2, 0.2, 0.2), noise=0.001, rows=13, seen=("UNCONSTRAINED",))
+
+
 # a linear and a bent model of two inputs under limits that move in time, or come with a call
 
 
@@ -502,6 +513,7 @@ OTHERS_ALONE = {
     **{f"moving end{name}": moving(*given) for name, given in {"": (), ", zero": ({"u_target": "zero"},)}.items()},
     "moving end, rates": moving({"R_delta": 0.2}, moves=(1, 1, 2, 3, 3)),
     "moving end, late": moving(estimator=km.LiftedDisturbance(), latency=2),
+    "moving end, vehicle": drive,
     "pushed": pushed,
     "scheduled": scheduled(False),
     "scheduled equations": scheduled(True),
@@ -517,7 +529,7 @@ RANDOM = {"levels": levels, "random linear": random_linear, "random bilinear": r
 KINDS = UPRIGHT | SWINGING | IN_TIME | OTHERS_ALONE
 QUICK = [
     *UPRIGHT, "bilinear", "bilinear, soft", "bilinear, rates", "bilinear, learned", "limits in time, rates", "price",
-    "limits of a call", "bilinear, limits in time, hard", "moving end", "pushed", "scheduled", "long preview", "steep", "tank",
+    "limits of a call", "bilinear, limits in time, hard", "moving end", "moving end, vehicle", "pushed", "scheduled", "long preview", "steep", "tank",
 ]  # fmt: skip
 SEEDS = {"levels": 60, "random linear": 24, "random bilinear": 12}
 

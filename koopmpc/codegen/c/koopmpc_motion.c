@@ -101,14 +101,13 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
   const koopmpc_real *last = s->reference + STEPS * RN, *sx = koopmpc_rest_size, *su = koopmpc_rest_size + NX;
   koopmpc_real at[KOOPMPC_LOCAL], *A = at + LOCAL_A, *B = at + LOCAL_B, *J = at + LOCAL_J;
   koopmpc_real S[GOAL * NX], SA[GOAL * NX], SB[GOAL * NV], R[NV * NV], inner[NV * NV], inverse[NV * NV], gain[NV * NX];
-  koopmpc_real K[NV * NX], BK[NX * NX], weighed[RN * NX], push[NX * RN], held[NX * RN], back[NX * GOAL];
+  koopmpc_real K[NV * NX], BK[NX * NX], weighed[RN * NX], seen[RN * NX], push[NX * RN], held[NX * RN], back[NX * GOAL];
   koopmpc_real H[LEAST * NX], T[LEAST * (RN + LEAST)], by[LEAST * RN];
-  koopmpc_real p[NX], next[NX], probe[NX], constant[NX], rest_input[NV];
-  int moves = 0, drifts = 0, steps = 1;
+  koopmpc_real p[NX], next[NX], constant[NX], rest_input[NV], power[NX * NX], squared[NX * NX], left[RN * NX];
+  int moves = 0, drifts = 0, goes_on = 1;
   for (int j = 0; j < RN; j++) moves |= !stands(s, j);
   if (!moves || !(end[TARGET_FOUND] > 0)) return;
-  for (int j = 0; j < RN; j++)
-    if (!extend(s, j, &drifts)) return;
+  for (int j = 0; j < RN && goes_on; j++) goes_on = extend(s, j, &drifts);
   koopmpc_local(end + TARGET_X, end + TARGET_U KOOPMPC_AND(koopmpc_end_w(s)), at);
   koopmpc_factors(at, H, T);
   for (int i = 0; i < LEAST; i++) /* the equilibrium that comes nearest to a row, by its size */
@@ -118,7 +117,7 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
     for (int j = 0; j < NV; j++) B[i * NV + j] *= su[j] / sx[i];
     for (int j = 0; j < RN; j++) J[j * NX + i] *= sx[i];
   }
-  if (drifts && !can_drift(s, by, J)) return;
+  if (drifts && !can_drift(s, by, J)) goes_on = 0;
   koopmpc_multiply(S, end + TARGET_M, J, GOAL, RN, NX, 0);
   for (int i = 0; i < GOAL * NX; i++) S[i] += end[TARGET_L + i] * sx[i % NX];
   koopmpc_multiply(SA, S, A, GOAL, NX, NX, 0);
@@ -137,27 +136,37 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
   koopmpc_multiply(gain, R, K, NV, NV, NX, 0);
   koopmpc_multiply(weighed, koopmpc_Q_root, J, RN, RN, NX, 0);
   koopmpc_multiply(push, weighed, koopmpc_Q_root, NX, RN, RN, 1);
+  koopmpc_multiply(seen, koopmpc_Q_root, weighed, RN, RN, NX, 1);
   koopmpc_multiply(held, gain, by + NX * RN, NX, NV, RN, 1);
   for (int i = 0; i < NV; i++) rest_input[i] = KOOPMPC_HOLDS ? 0 : end[TARGET_U + i] / su[i];
   koopmpc_multiply(constant, gain, rest_input, NX, NV, 1, 1);
   for (int i = 0; i < NX * RN && KOOPMPC_HOLDS; i++) push[i] -= held[i];
+  koopmpc_copy(power, A, NX * NX);
+  for (int k = 1; k < KOOPMPC_REST_STEPS; k *= 2) { /* (A - B K) to the power REST_STEPS */
+    koopmpc_multiply(squared, power, power, NX, NX, NX, 0);
+    koopmpc_copy(power, squared, NX * NX);
+  }
   koopmpc_fill(p, 0, NX);
-  koopmpc_fill(probe, 1, NX);
-  while (steps < FURTHER + 1) steps *= 2;
-  for (int k = steps - 1; k >= 0; k--) { /* p = push (r - of) + constant + (A - B K)' p */
+  for (int k = FURTHER; k >= 0 && goes_on; k--) { /* p = push (r - of) + constant + (A - B K)' p */
     koopmpc_multiply(next, A, p, NX, NX, 1, 1);
-    for (int i = 0; i < NX && k <= FURTHER; i++) {
+    for (int i = 0; i < NX; i++) {
       const koopmpc_real *row = k ? s->beyond + (k - 1) * RN : last;
       next[i] += constant[i];
       for (int j = 0; j < RN; j++) next[i] += push[i * RN + j] * (row[j] - at[LOCAL_OF + j]);
     }
     koopmpc_copy(p, next, NX);
-    koopmpc_multiply(next, A, probe, NX, NX, 1, 1);
-    koopmpc_copy(probe, next, NX);
   }
-  if (!koopmpc_usable(p, NX)) return;
-  for (int i = 0; i < NX; i++)
-    if (!(koopmpc_abs(probe[i]) < KOOPMPC_BURSTS)) return;
+  koopmpc_multiply(left, seen, power, RN, NX, NX, 0);
+  if (!(koopmpc_dot(left, left, RN * NX) <= KOOPMPC_LEFT * KOOPMPC_LEFT * koopmpc_dot(seen, seen, RN * NX)) ||
+      !koopmpc_usable(p, NX)) {
+    koopmpc_weigh_row(end, koopmpc_Q_root); /* errors of the tracked outputs do not come to rest: no tail */
+    return;
+  }
+  if (!goes_on) { /* the last row takes the place of what the equilibrium gives */
+    for (int i = 0; i < GOAL; i++)
+      for (int j = 0; j < RN; j++) end[TARGET_GOAL + i] += end[TARGET_M + i * RN + j] * (last[j] - at[LOCAL_OF + j]);
+    return;
+  }
   (void)koopmpc_inverse(S, GOAL, NX, KOOPMPC_SEEN, back, 0);
   for (int i = 0; i < GOAL; i++)
     for (int j = 0; j < NX; j++) end[TARGET_GOAL + i] += back[j * GOAL + i] * p[j];

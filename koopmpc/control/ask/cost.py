@@ -93,10 +93,10 @@ class Cost(Value):
         output needs a weight in Q. The tail of linear controllers counts q too, and so does ``tail=0`` at x_N; other
         ends do not. For the controllers that know `price`.
     beyond
-        What a reference does after the rows that a step is given. "rest": the last row stays. "motion", the default of
-        BilinearMPC and NonlinearMPC without Q_N, tail and given u_target: it goes on by the linear recurrence that all
-        these rows obey, as sines, ramps and their sums do, and the end of the plan aims there; rows that obey none
-        rest. Other controllers rest.
+        What a reference does after the rows that a step is given. "rest": the last row stays, as with all linear
+        controllers. "motion" is the default of BilinearMPC and NonlinearMPC without Q_N, tail and given u_target. Where
+        the last rows still move, the end follows the linear recurrence of these rows, such as a sine or a ramp; without
+        one it weighs x_N from the last row; where no linear loop can follow, it has no tail.
 
     Raises
     ------
@@ -137,7 +137,7 @@ class Cost(Value):
 
     @property
     def moves_on(self) -> bool:
-        """Whether the end of a plan follows a reference that goes on as it moved."""
+        """Whether the end of a plan follows a reference that moves at its last row."""
         return self.beyond != "rest" and self.Q_N is None and self.tail is None
 
     def resolve(self, states: Sequence[str], inputs: Sequence[str]) -> "Cost":

@@ -21,30 +21,30 @@ RESTS = 3  # equal rows at the end of a preview that say that the reference rest
 STILL = 1e-12  # share of the largest row below which a column does not move
 TERMS = 1e-11  # directions of a column's past below this share of the largest have no coefficient
 ROUNDING = 1e-13  # directions of the inputs below this share of the largest have no gain
-BURSTS = 1e3  # the end stays where the loop behind it, or one without damping, would grow by this factor
+REST_STEPS = 1024  # steps in which the loop behind the end brings errors of the tracked outputs to rest
+LEFT = 0.1  # share of these errors that may be left then
 SEEN = 1e-5  # directions of x_N below this share of the largest cost nothing at the end
 
 
 class Course(NamedTuple):
-    """Rows of a reference behind its preview, none where it rests, and whether it drifts, as a ramp does."""
+    """Rows of a reference behind a moving preview, none without a recurrence, and whether it drifts, as a ramp does."""
 
     rows: Float[np.ndarray, "T nr"]
     drifts: bool = False
 
 
-def extend_rows(R: Float[np.ndarray, "N1 nr"], horizons: int = BEYOND) -> Course:
+def extend_rows(R: Float[np.ndarray, "N1 nr"], horizons: int = BEYOND) -> Course | None:
     """Return the rows after R by the shortest linear recurrence r_k = Σ c_i r_{k−i} + c that all rows of R obey.
 
-    None, (0, nr), if the last rows rest, or if a column obeys no such recurrence, or one that grows. A column that
-    drifts goes on for one horizon and rests then.
+    (0, nr) if a column obeys no such recurrence, or one that grows; None if the last rows rest. A column that drifts
+    goes on for one horizon and rests then.
     """
-    nothing, N = Course(np.zeros((0, R.shape[1]))), len(R) - 1
     if not horizons or (R[-RESTS:] == R[-1]).all():
-        return nothing
-    columns = [_extend_column(column, horizons * N) for column in R.T]
+        return None
+    columns = [_extend_column(column, horizons * (len(R) - 1)) for column in R.T]
     known = [column for column in columns if column is not None]
     if len(known) < len(columns):
-        return nothing
+        return Course(np.zeros((0, R.shape[1])))
     return Course(np.column_stack([rows for rows, _ in known]), any(drifts for _, drifts in known))
 
 
@@ -104,8 +104,11 @@ def shift_end(
     size: Float[np.ndarray, " n"],
     rows: Float[np.ndarray, "T1 nr"],
     held: Float[np.ndarray, "nu nr"] | None,
-) -> TerminalCost:
+) -> TerminalCost | None:
     """Return the cost of x_N where the rows r_N, r_{N+1}, … come, by the linear tracking problem behind x_N.
+
+    A single row, after which nothing is known, takes the place of of(x_r). None where the loop of the linearisation
+    leaves errors of the tracked outputs: a vehicle at rest cannot move sideways, and its tail would invent a motion.
 
     u is the input of the equilibrium x_r. With x̃ = x − x_r and δ_k = r_k − of(x_r) the cost-to-go is
     x̃ᵀP x̃ − 2 p_Nᵀx̃ + …, so the target moves by P⁺p_N. Backward from p = 0 after the last row,
@@ -126,21 +129,24 @@ def shift_end(
     K: Float[np.ndarray, "nu nx"] = np.asarray(np.linalg.lstsq(R + B.T @ PB, PB.T @ A, rcond=ROUNDING)[0])
     D = rows - at.of
     wanted = np.tile(-u / su, (len(D), 1)) if held is None else D @ (held / su[:, None]).T
-    p, closed = D @ Q @ J - wanted @ (R @ K), A - B @ K
+    p, closed, seen = D @ Q @ J - wanted @ (R @ K), A - B @ K, Q @ J
     with np.errstate(over="ignore", invalid="ignore"):
+        left = np.linalg.norm(seen @ np.linalg.matrix_power(closed, REST_STEPS))
         while len(p) > 1:  # Σ closedᵀᵏ p_k: neighbours at once
             if len(p) % 2:
                 p = np.vstack([p, np.zeros(nx)])
             p, closed = p[::2] + p[1::2] @ closed, closed @ closed
-        stays = np.abs(closed.sum(axis=0)).max() < BURSTS and np.abs(p).max() < checks.HUGE
-    return end._replace(m=end.m + p[0] @ np.linalg.pinv(S, rcond=SEEN)) if stays else end
+    if not (left <= LEFT * np.linalg.norm(seen) and np.abs(p).max() < checks.HUGE):
+        return None
+    return end._replace(m=end.m + (p[0] @ np.linalg.pinv(S, rcond=SEEN) if len(D) > 1 else end.M @ D[0]))
 
 
 class _Preview(NamedTuple):
     """What the rows of a reference ask for, before disturbances.
 
     R holds the rows r_0 … r_N, U and `slopes` the reference inputs and ∂u/∂e of all but the last, `held` says which of
-    these equal the last one, and `target` is the last one's. `beyond` is how the reference goes on.
+    these equal the last one, and `target` is the last one's. `beyond` is how the reference goes on, None where it rests
+    or the end is not to follow.
     """
 
     R: Float[np.ndarray, "N1 nr"]
@@ -148,7 +154,7 @@ class _Preview(NamedTuple):
     slopes: Float[np.ndarray, "N nu nx"]
     held: Bool[np.ndarray, " N"]
     target: RowTarget
-    beyond: Course
+    beyond: Course | None
 
 
 class StageAim:
@@ -248,17 +254,18 @@ class StageAim:
         return TerminalCost(M, np.zeros_like(cost.L), np.zeros_like(cost.V), M @ last)
 
     def _move_end(self, preview: _Preview, cost: TerminalCost) -> TerminalCost:
-        """Return the terminal cost where the reference goes on beyond its rows."""
+        """Return the terminal cost where the reference moves at its last row."""
         R, beyond, o, search = preview.R, preview.beyond, self._outputs, self.targets.equilibria
-        if not len(beyond.rows):
+        if beyond is None:
             return cost
         rest = self.end.equilibrium
         at = search.linearise(rest.x, rest.u)
         followed = search.follow_row(at)
-        if beyond.drifts and not can_drift(at, followed, o.Q_root, R):
-            return cost
+        goes_on = not beyond.drifts or can_drift(at, followed, o.Q_root, R)
+        rows = np.vstack([R[-1], beyond.rows]) if goes_on else R[-1:]
         held = followed[len(rest.x) :] if self.targets.holds else None
-        return shift_end(cost, rest.u, at, (o.Q, o.R), search.size, np.vstack([R[-1], beyond.rows]), held)
+        moved = shift_end(cost, rest.u, at, (o.Q, o.R), search.size, rows, held)
+        return self._weigh_last(R, cost, trajectory=True) if moved is None else moved
 
 
 def _add_last_input(
