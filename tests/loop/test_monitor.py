@@ -9,6 +9,7 @@ import pytest
 import koopmpc as km
 from tests.bare import shown
 from tests.example_plants import Pendulum
+from tests.gathered import of_loop
 
 DT = 0.05
 LIFTING = km.State() + km.Fourier(1, states=[0]) + km.Constant()
@@ -20,6 +21,12 @@ def collected(rng=0, episodes=40, **plant):
     return km.collect(
         step_map, km.Uniform([-1.5, -3], [1.5, 3]), km.Noise(-6, 6, hold=3), episodes=episodes, steps=40, rng=rng
     )
+
+
+def run_pendulum(mpc, x0, steps, **options):
+    """Return a run of the pendulum towards its rest."""
+    plant = km.discretize(Pendulum(), DT)
+    return km.simulate(plant, mpc, x0=x0, reference=[0, 0], steps=steps, **of_loop(**options))
 
 
 @pytest.fixture(scope="module")
@@ -88,21 +95,19 @@ def test_a_state_or_an_input_beyond_the_data_is_unknown(model, data):
 
 
 def test_a_push_is_unknown_when_it_comes_and_for_that_step_alone(model, data):
-    step_map, mpc = km.discretize(Pendulum(), DT), km.KoopmanMPC(model, COST, LIMITS, 15, monitor=data)
+    mpc = km.KoopmanMPC(model, COST, LIMITS, 15, monitor=data)
     push = np.zeros((40, 2))
     push[20, 1] = 1.0
-    run = km.simulate(
-        step_map, mpc, x0=[0.5, 0], reference=[0, 0], steps=40, options=km.loop.LoopOptions(disturbance=push)
-    )
+    run = run_pendulum(mpc, [0.5, 0], 40, disturbance=push)
     assert np.flatnonzero(run.known == 0).tolist() == [21]
     assert km.metrics(run).unknown == 1
     assert "unknown steps             1" in str(km.metrics(run))
 
 
 def test_without_a_monitor_nobody_says(model):
-    step_map, mpc = km.discretize(Pendulum(), DT), km.KoopmanMPC(model, COST, LIMITS, 15)
+    mpc = km.KoopmanMPC(model, COST, LIMITS, 15)
     assert mpc([0.1, 0], [0, 0]).known is None
-    run = km.simulate(step_map, mpc, x0=[0.5, 0], reference=[0, 0], steps=5)
+    run = run_pendulum(mpc, [0.5, 0], 5)
     assert (run.known == -1).all()
     assert km.metrics(run).unknown is None
     assert "unknown" not in str(km.metrics(run))
@@ -110,14 +115,7 @@ def test_without_a_monitor_nobody_says(model):
 
 def test_a_measurement_that_is_nan_is_unknown_and_the_next_step_but_one_is_known_again(model, data):
     mpc = km.KoopmanMPC(model, COST, LIMITS, 15, monitor=data)
-    run = km.simulate(
-        km.discretize(Pendulum(), DT),
-        mpc,
-        x0=[0.5, 0],
-        reference=[0, 0],
-        steps=8,
-        options=km.loop.LoopOptions(faults=[km.faults.NaNSensor(begin=4, end=5)]),
-    )
+    run = run_pendulum(mpc, [0.5, 0], 8, faults=[km.faults.NaNSensor(begin=4, end=5)])
     assert run.known.tolist() == [1, 1, 1, 1, 0, 0, 1, 1]
 
 
@@ -128,23 +126,12 @@ def test_a_sensor_that_stands_still_is_unknown(model, data):
 
 def test_the_estimated_disturbance_and_the_input_that_was_applied_count_in_the_prediction(model, data):
     """A constant push is unknown at first, and known once it is estimated."""
-    step_map = km.discretize(Pendulum(), DT)
     mpc = km.KoopmanMPC(model, COST, LIMITS, 15, estimator=km.LiftedDisturbance(), monitor=data)
-    run = km.simulate(
-        step_map, mpc, x0=[0.1, 0], reference=[0, 0], steps=150, options=km.loop.LoopOptions(disturbance=[0.0, 0.1])
-    )
+    run = run_pendulum(mpc, [0.1, 0], 150, disturbance=[0.0, 0.1])
     assert (run.known[1:3] == 0).all()
     assert (run.known[100:] == 1).all()
     plain = km.KoopmanMPC(model, COST, LIMITS, 15, monitor=data)
-    broken = km.simulate(
-        step_map,
-        plain,
-        x0=[1.0, 0],
-        reference=[0, 0],
-        steps=60,
-        limits=LIMITS,
-        options=km.loop.LoopOptions(faults=[km.faults.ActuatorLoss(0.5)]),
-    )
+    broken = run_pendulum(plain, [1.0, 0], 60, limits=LIMITS, faults=[km.faults.ActuatorLoss(0.5)])
     assert broken.known.mean() > 0.95  # the loop tells the controller what was applied
 
 
@@ -172,14 +159,7 @@ def test_a_bilinear_mpc_knows_likewise(data):
     mpc = km.BilinearMPC(bilinear, COST, LIMITS, 10, monitor=data)
     push = np.zeros((30, 2))
     push[20, 1] = 1.0
-    run = km.simulate(
-        km.discretize(Pendulum(), DT),
-        mpc,
-        x0=[0.3, 0],
-        reference=[0, 0],
-        steps=30,
-        options=km.loop.LoopOptions(disturbance=push),
-    )
+    run = run_pendulum(mpc, [0.3, 0], 30, disturbance=push)
     assert run.known[21] == 0
     assert np.delete(run.known, 21).mean() > 0.9
     again = copy.copy(mpc)
@@ -197,7 +177,7 @@ def test_a_controller_that_is_saved_or_copied_knows_the_same(model, data, tmp_pa
 
 def test_a_log_keeps_what_was_known(model, data, tmp_path):
     mpc = km.KoopmanMPC(model, COST, LIMITS, 15, monitor=data)
-    run = km.simulate(km.discretize(Pendulum(), DT), mpc, x0=[1.0, 9.0], reference=[0, 0], steps=30)
+    run = run_pendulum(mpc, [1.0, 9.0], 30)
     assert 0 < (run.known == 0).sum() < 30
     km.record(run, tmp_path / "run.rrd")
     assert km.load_run(tmp_path / "run.rrd") == run

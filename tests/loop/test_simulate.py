@@ -29,22 +29,18 @@ def mpc(**kwargs):
     return km.KoopmanMPC(linear(A, B), km.Cost(1, 0.1), km.Limits(-0.5, 0.5), 6, **kwargs)
 
 
+def run_map(controller, steps, reference=(0, 0), x0=(0.5, 0), **options):
+    """Return a run on the map of A and B."""
+    return km.simulate(step_map(A, B), controller, x0=x0, reference=reference, steps=steps, **of_loop(**options))
+
+
 def test_simulate_is_the_loop_that_one_would_write():
     plant, controller, other = step_map(A, B), mpc(), mpc()
     steps = 20
     t = np.arange(steps + 1)
     reference = np.column_stack([0.4 * np.sin(0.3 * t), 0.0 * t])
     cost, limits = km.Cost(1, 0.1), km.Limits(-0.5, 0.5)
-    run = km.simulate(
-        plant,
-        controller,
-        x0=[0.5, -0.2],
-        reference=reference,
-        steps=steps,
-        cost=cost,
-        limits=limits,
-        options=km.loop.LoopOptions(plans=True),
-    )
+    run = run_map(controller, steps, reference, [0.5, -0.2], cost=cost, limits=limits, plans=True)
     x, plans = np.array([0.5, -0.2]), []
     ahead = np.vstack([reference, np.tile(reference[-1], (6, 1))])
     for k in range(steps):
@@ -75,14 +71,7 @@ def test_simulate_is_the_loop_that_one_would_write():
 def test_the_controller_gets_the_references_ahead_and_what_was_applied(preview):
     controller = Recorded()
     reference = np.arange(12.0).reshape(6, 2)
-    run = km.simulate(
-        step_map(A, B),
-        controller,
-        x0=[1, 2],
-        reference=reference,
-        steps=5,
-        options=km.loop.LoopOptions(preview=preview),
-    )
+    run = run_map(controller, 5, reference, [1, 2], preview=preview)
     np.testing.assert_array_equal(controller.resets, [[1.0, 2.0]])
     assert len(controller.calls) == 5
     for k, (y, rows, applied) in enumerate(controller.calls):
@@ -115,14 +104,7 @@ def test_one_reference_is_held_throughout():
 
 def test_noise_is_on_the_measurement_alone_and_comes_from_the_seed():
     def noisy(rng, noise):
-        return km.simulate(
-            step_map(A, B),
-            mpc(),
-            x0=[0.5, 0],
-            reference=[0, 0],
-            steps=60,
-            options=km.loop.LoopOptions(noise=noise, rng=rng),
-        )
+        return run_map(mpc(), 60, noise=noise, rng=rng)
 
     run, same = noisy(3, [0.1, 0.0]), noisy(np.random.default_rng(3), [0.1, 0.0])
     np.testing.assert_array_equal(run.Y, same.Y)
@@ -142,14 +124,7 @@ def test_a_disturbance_is_added_to_the_next_state(kind):
     rows = 0.01 * np.arange(20.0).reshape(10, 2)
     disturbance = {"constant": [0.1, -0.2], "rows": rows, "function": lambda k, rng: rows[k]}[kind]
     expected = np.tile([0.1, -0.2], (10, 1)) if kind == "constant" else rows
-    run = km.simulate(
-        step_map(A, B),
-        Recorded(),
-        x0=[1, 2],
-        reference=[0, 0],
-        steps=10,
-        options=km.loop.LoopOptions(disturbance=disturbance),
-    )
+    run = run_map(Recorded(), 10, x0=[1, 2], disturbance=disturbance)
     np.testing.assert_allclose(run.X[1:] - run.X[:-1] @ A.T - run.U @ B.T, expected, atol=1e-12)
 
 
@@ -161,17 +136,8 @@ def test_the_plant_may_differ_from_the_model():
 
 def test_observers_see_each_step_once():
     seen = []
-    controller = mpc()
     reference = np.column_stack([np.arange(7.0), np.zeros(7)])
-    run = km.simulate(
-        step_map(A, B),
-        controller,
-        x0=[0.5, 0],
-        reference=reference,
-        steps=6,
-        options=km.loop.LoopOptions(noise=0.01),
-        observers=[lambda step: seen.append((step, step.plan))],
-    )
+    run = run_map(mpc(), 6, reference, noise=0.01, observers=[lambda step: seen.append((step, step.plan))])
     assert [step.k for step, _ in seen] == list(range(6))
     for k, (step, plan) in enumerate(seen):
         for got, row in (
@@ -192,15 +158,7 @@ def test_observers_see_each_step_once():
 @pytest.mark.parametrize("given", [None, 0.3, [0.3], 0.1 * np.arange(6.0)[:, None]])
 def test_the_inputs_that_hold_the_reference_are_kept_and_shown(given):
     seen = []
-    run = km.simulate(
-        step_map(A, B),
-        mpc(),
-        x0=[0.5, 0],
-        reference=[0, 0],
-        steps=6,
-        options=km.loop.LoopOptions(u_reference=given),
-        observers=[seen.append],
-    )
+    run = run_map(mpc(), 6, u_reference=given, observers=[seen.append])
     expected = np.broadcast_to(0.0 if given is None else given, (6, 1))
     np.testing.assert_array_equal(run.u_reference, expected)
     np.testing.assert_array_equal([step.u_reference for step in seen], expected)
@@ -266,12 +224,7 @@ class Careless(Recorded):
 
 def test_a_controller_that_writes_into_its_arguments_moves_neither_plant_nor_record():
     for noise in (None, 0.01):
-        careful, careless = (
-            km.simulate(
-                step_map(A, B), each, x0=[0.5, 0], reference=[0, 0], steps=6, options=km.loop.LoopOptions(noise=noise)
-            )
-            for each in (Recorded(), Careless())
-        )
+        careful, careless = (run_map(each, 6, noise=noise) for each in (Recorded(), Careless()))
         np.testing.assert_array_equal(careless.X, careful.X)
         np.testing.assert_array_equal(careless.Y, careful.Y)
         np.testing.assert_array_equal(careless.U, careful.U)
