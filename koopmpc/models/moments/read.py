@@ -99,7 +99,9 @@ def second_moments(
     reading = _ReadTask(None, bound, source.inputs, bilinear, _align_weights(weights, source))
     zero = Moments(bound, source.inputs, source.dt, 0, 0.0, "", np.empty((0, 0)), bilinear, embedding)
 
-    run = partial(map_tasks, read_part, workers=workers, scheduler=scheduler, progress=progress)
+    run: Callable[..., Iterator[_Sums | None]] = partial(map, read_part)
+    if (workers, scheduler, progress) != (None, None, None):
+        run = partial(map_tasks, read_part, workers=workers, scheduler=scheduler, progress=progress)
     if route is None and source.replayable:
         total = _add_up(source, reading, replace(zero, route="gram"), run, judged=True)
         if total is not None:

@@ -178,9 +178,9 @@ def choose_ridge(
     error, the data have no noise and λ is 0. The errors are those of one step; `select` chooses a ridge by errors over
     a horizon on held-out folds.
 
-    `s` holds the singular values of P on unit-norm columns, where those below `cut` times the largest are rounding
-    errors, `shares` is UᵀT, `outside` the energy ‖t − U Uᵀ t‖² of each target outside the span of P, and `samples` the
-    number M of snapshot pairs. λ acts on unit-norm columns.
+    `s` holds the singular values of P on unit-norm columns; those below `cut` times the largest are rounding errors.
+    `shares` is UᵀT, `outside` the energy ‖t − U Uᵀ t‖² of each target outside the span of P, and `samples` is M, the
+    number of snapshot pairs. λ acts on unit-norm columns.
 
     References
     ----------
