@@ -2,6 +2,7 @@
 
 import ctypes
 from functools import partial
+from importlib.resources import files
 
 import casadi as ca
 import numpy as np
@@ -31,6 +32,25 @@ def run_in_c(graph: Graph, rows: np.ndarray) -> np.ndarray:
     for row in results:
         code.f(ctypes.c_void_p(row.ctypes.data), ctypes.c_void_p(row.ctypes.data))
     return results[:, : graph.m]
+
+
+@needs_compiler
+@pytest.mark.parametrize("place", [0, 1, 2, None])
+def test_the_largest_of_a_row_is_no_number_where_an_entry_is_none(place):
+    """A solution with a NaN in it must not pass the test of its residuals, wherever the NaN stands."""
+    command = find_compiler()
+    assert command is not None
+    step = files("koopmpc").joinpath("codegen/c/koopmpc_step.h").read_text()
+    code = step[
+        step.index("static inline koopmpc_real koopmpc_abs") : step.index("static inline koopmpc_real koopmpc_dot")
+    ]
+    wrapped = "double largest(const double *a, int n) { return koopmpc_largest(a, n); }\n"
+    largest = load_library(f"{HEAD}#define KOOPMPC_HUGE 1e30\n{code}{wrapped}", command, None).largest
+    largest.restype = ctypes.c_double
+    row = np.array([-3.0, 1.0, 2.0])
+    if place is not None:
+        row[place] = np.nan
+    assert np.array_equal(largest(ctypes.c_void_p(row.ctypes.data), 3), np.abs(row).max(), equal_nan=True)
 
 
 def trace_all_operations() -> Graph:

@@ -19,7 +19,7 @@ static inline int koopmpc_usable(const koopmpc_real *a, int n) {
 /** The larger of `most` and |value|; NaN stays. */
 static inline koopmpc_real koopmpc_most(koopmpc_real most, koopmpc_real value) {
   value = koopmpc_abs(value);
-  return value <= most ? most : value;
+  return value <= most || !(most >= 0) ? most : value;
 }
 
 /** The largest of |a|. */
