@@ -9,7 +9,7 @@ References
 Rousseeuw & Van Driessen, "Computing LTS regression for large data sets", Data Min. Knowl. Discov. 12, 2006.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations, pairwise
@@ -104,7 +104,7 @@ def find_changes(log: Log) -> Iterator[LogFault]:
     law, agreeing = _fit_consensus(log, places)
     if law is None:
         return
-    segments: list[Segment] = [_read_segment(log, place) for place in places]
+    segments = [_read_segment(log, place) for place in places]
     errors = np.array([law.errors(*segment) for segment in segments])
     spread = np.quantile(errors[sorted(agreeing)].max(axis=1), 0.9)
     most = (np.clip(errors, spread, None) - spread).mean(axis=1)  # the most that a change can gain
@@ -116,20 +116,24 @@ def find_changes(log: Log) -> Iterator[LogFault]:
     for change in _list_changes(log, law, [segments[s] for s in apart]):
         gains = {s: _measure_gain(change, law, segments[s], errors[s], spread, most[s]) for s in apart}
         explained = [s for s, gain in gains.items() if gain > 0]
-        if not explained or (len(explained) == 1 and change.tuned):
-            continue
-        between = agreeing.intersection(range(explained[0], explained[-1]))
-        if len(log.data) == 1 and len(between) > 0.2 * len(explained):
-            continue  # within one episode a recorder changes once, and does not change back
-        total = sum(gains[s] for s in explained)
-        if best is None or total > 1.02 * best[0]:
+        total = sum(gains.values())
+        if _is_credible(log, change, explained, agreeing) and (best is None or total > 1.02 * best[0]):
             best = (total, change, explained)
-    if best is None:
-        return
-    _, change, explained = best
-    places = tuple(places[s] for s in explained)
+    if best is not None:
+        yield _describe_change(log, best[1], tuple(places[s] for s in best[2]))
+
+
+def _is_credible(log: Log, change: Change, explained: list[int], agreeing: set[int]) -> bool:
+    """Return whether a recorder may have made this change: in one episode it changes once, and does not change back."""
+    if len(explained) < 1 + change.tuned:
+        return False
+    between = agreeing.intersection(range(explained[0], explained[-1]))
+    return len(log.data) > 1 or len(between) <= 0.2 * len(explained)
+
+
+def _describe_change(log: Log, change: Change, places: tuple[Place, ...]) -> LogFault:
     where = name_episodes(places) if len(log.data) > 1 else f"from row {places[0].first} on"
-    yield LogFault(
+    return LogFault(
         change.kind,
         f"{change.says} in {where}: undone, these rows follow the law of the others",
         "undo it there, or leave these episodes out",
@@ -205,47 +209,34 @@ def _fit_consensus(log: Log, segments: list[Place]) -> tuple[OneStepLaw | None, 
 
 def _list_changes(log: Log, law: OneStepLaw, segments: list[Segment]) -> Iterator[Change]:
     """Yield the changes of sign, order, unit, offset and sample time that a recorder may make."""
-    data = log.data
-    flipped = "has the other sign"
-    for i, name in enumerate(data.states):
-        yield Change(
-            "sensor sign", (name,), f"{strip_unit(name)} {flipped}", partial(_rescale_state, i, -1.0), tuned=False
-        )
-    for j, name in enumerate(data.inputs):
-        yield Change(
-            "input sign", (name,), f"{strip_unit(name)} {flipped}", partial(_rescale_input, j, -1.0), tuned=False
-        )
+    data, names, nx = log.data, [strip_unit(name) for name in log.names], log.data.nx
+
+    def edit(
+        kind: str, says: str, columns: Sequence[int], sources: Sequence[int], factor: float = 1.0, by: float = 0.0
+    ) -> Change:
+        allowance = max(-float(np.log(abs(factor))), 0.0) if columns[0] < nx else 0.0
+        undone = partial(_edit, list(columns), list(sources), factor, by)
+        tuned = kind in ("unit change", "offset change")
+        return Change(kind, tuple(log.names[i] for i in columns), says, undone, allowance, tuned)
+
+    for i, name in enumerate(names):
+        yield edit("sensor sign" if i < nx else "input sign", f"{name} has the other sign", [i], [i], -1.0)
+    inputs = range(nx, nx + data.nu)
     if data.nu > 1:
-        undone = partial(_rescale_input, slice(None), -1.0)
-        yield Change("input sign", data.inputs, f"every input {flipped}", undone, tuned=False)
-    for kind, names, swap in (
-        ("swapped sensors", data.states, _swap_states),
-        ("swapped inputs", data.inputs, _swap_inputs),
-    ):
-        for i, j in combinations(range(len(names)), 2):
-            says = f"{strip_unit(names[i])} and {strip_unit(names[j])} are swapped"
-            yield Change(kind, (names[i], names[j]), says, partial(swap, i, j), tuned=False)
+        yield edit("input sign", "every input has the other sign", inputs, inputs, -1.0)
+    for i, j in (*combinations(range(nx), 2), *combinations(inputs, 2)):
+        kind = "swapped sensors" if j < nx else "swapped inputs"
+        yield edit(kind, f"{names[i]} and {names[j]} are swapped", [i, j], [j, i])
     for label, factor in _FACTORS.items():
         for up, text in ((factor, f"{label} times as large"), (1 / factor, f"{label} times as small")):
-            for i, name in enumerate(data.states):
-                allowance = max(float(np.log(up)), 0.0)
-                yield Change(
-                    "unit change",
-                    (name,),
-                    f"{strip_unit(name)} is {text}",
-                    partial(_rescale_state, i, 1 / up),
-                    allowance,
-                )
-            for j, name in enumerate(data.inputs):
-                yield Change(
-                    "unit change", (name,), f"{strip_unit(name)} is {text}", partial(_rescale_input, j, 1 / up)
-                )
-    for i, name in enumerate(data.states):
+            for i, name in enumerate(names):
+                yield edit("unit change", f"{name} is {text}", [i], [i], 1 / up)
+    for i, name in enumerate(names[:nx]):
         b = _find_offset(log, law, segments[: _LIMITS.offset_segments], i)
         turns = round(b / (2 * np.pi))
         if i in log.angles and abs(b - 2 * np.pi * turns) < (_LIMITS.no_turn if turns else _LIMITS.no_offset):
             continue
-        yield Change("offset change", (name,), f"{strip_unit(name)} is {b:+.3g} off", partial(_shift_state, i, -b))
+        yield edit("offset change", f"{name} is {b:+.3g} off", [i], [i], by=-b)
     for r in (2, 3, 4):  # a disturbance moves a speed r times as far in r steps, and a position r² times
         apart, close = f"as far apart ({r * data.dt:.3g} s)", f"as close ({data.dt / r:.3g} s)"
         allowance = 2 * float(np.log(r))
@@ -256,36 +247,17 @@ def _list_changes(log: Log, law: OneStepLaw, segments: list[Segment]) -> Iterato
 # Each function below returns the errors of a segment after one change is undone.
 
 
-def _rescale_state(i: int, factor: float, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
-    X = X.copy()
-    X[:, i] *= factor
-    errors = law.errors(X, U)
-    errors[i] -= min(float(np.log(abs(factor))), 0.0)  # a state that is scaled down has small errors in any case
+def _edit(
+    columns: list[int], sources: list[int], factor: float, by: float, law: OneStepLaw, X: np.ndarray, U: np.ndarray
+) -> np.ndarray:
+    """Signals, of which inputs follow the states, are `factor` times the sources plus `by`."""
+    nx = X.shape[1]
+    signals = np.hstack([X, np.vstack([U, U[-1:]])])
+    signals[:, columns] = factor * signals[:, sources] + by
+    errors = law.errors(signals[:, :nx], signals[:-1, nx:])
+    # a state that is scaled down has small errors in any case
+    errors[[i for i in columns if i < nx]] -= min(float(np.log(abs(factor))), 0.0)
     return errors
-
-
-def _rescale_input(j: int | slice, factor: float, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
-    U = U.copy()
-    U[:, j] *= factor
-    return law.errors(X, U)
-
-
-def _swap_states(i: int, j: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
-    X = X.copy()
-    X[:, [i, j]] = X[:, [j, i]]
-    return law.errors(X, U)
-
-
-def _swap_inputs(i: int, j: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
-    U = U.copy()
-    U[:, [i, j]] = U[:, [j, i]]
-    return law.errors(X, U)
-
-
-def _shift_state(i: int, by: float, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
-    X = X.copy()
-    X[:, i] += by
-    return law.errors(X, U)
 
 
 def _step_repeatedly(r: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:

@@ -166,17 +166,9 @@ def find_stuck_sensors(log: Log) -> Iterator[LogFault]:
     longest = {
         i: max(_LIMITS.stuck_rows, 6 * _usual_stay(log, i)) if i in rough else _LIMITS.stuck_rows for i in moving
     }
-    for e, episode in enumerate(log.data):
-        for i in moving:
-            others = np.delete(episode.X, i, axis=1) / np.delete(log.size, i)
-            others = np.hstack([others, np.vstack([episode.U, episode.U[-1:]]) / log.input_size])
-            for a, b in find_stretches(np.diff(episode.X[:, i]) == 0):
-                if b - a < longest[i] or not others.shape[1]:
-                    continue
-                moved = np.mean(np.diff(others[a : b + 1], axis=0) != 0, axis=0) > 0.5
-                if np.ptp(others[a : b + 1], axis=0)[moved].max(initial=0.0) > 0.05:
-                    stays = at_end if episode.X[a, i] in (low[i], high[i]) else places
-                    stays.setdefault(i, []).append(Place(e, a, b + 1))
+    for i, place in _list_stays(log, longest):
+        stays = at_end if log.data[place.episode].X[place.first, i] in (low[i], high[i]) else places
+        stays.setdefault(i, []).append(place)
     for i, stays in at_end.items():
         values = {float(log.data[p.episode].X[p.first, i]) for p in stays}
         alone = len(stays) == 1 or any(p.last - p.first == len(log.data[p.episode].X) for p in stays)
@@ -191,6 +183,20 @@ def find_stuck_sensors(log: Log) -> Iterator[LogFault]:
             (log.data.states[i],),
             tuple(stays),
         )
+
+
+def _list_stays(log: Log, longest: dict[int, int]) -> Iterator[tuple[int, Place]]:
+    """Yield where these states stand still for as many steps or more, although other signals move."""
+    for e, episode in enumerate(log.data):
+        for i, least in longest.items():
+            others = np.delete(episode.X, i, axis=1) / np.delete(log.size, i)
+            others = np.hstack([others, np.vstack([episode.U, episode.U[-1:]]) / log.input_size])
+            for a, b in find_stretches(np.diff(episode.X[:, i]) == 0):
+                if b - a < least or not others.shape[1]:
+                    continue
+                moved = np.mean(np.diff(others[a : b + 1], axis=0) != 0, axis=0) > 0.5
+                if np.ptp(others[a : b + 1], axis=0)[moved].max(initial=0.0) > 0.05:
+                    yield i, Place(e, a, b + 1)
 
 
 def _usual_stay(log: Log, i: int) -> int:
@@ -250,46 +256,45 @@ def find_held_samples(log: Log) -> Iterator[LogFault]:
     live = [i for i in range(log.data.nx) if i not in rough and np.ptp(log.X[:, i]) > 0]
     if not live or len(find_slow_states(log)) == len(live):
         return
-    places: list[Place] = []
-    travels: list[float] = []
-    smooth, limits = _find_smoothest_state(log, live), find_sensor_limits(log)
-    by_chance, again = _repeat_by_chance(log, live), 0
-    for e, episode in enumerate(log.data):
-        X, U = episode.X, episode.U
-        same = (np.diff(X[:, live], axis=0) == 0).all(axis=1)
-        for a, b in find_stretches(same):
-            if b >= len(U) or a == 0 or all(X[a, i] in limits.get(i, ()) for i in live):  # sensors at their limits
-                continue
-            if by_chance and b - a == 1:
-                continue
-            again += np.array_equal(U[b - 1], U[b])
-            contradiction = np.array_equal(U[b - 1], U[b]) or (np.ptp(U[a:b], axis=0) > 0).any()
-            if contradiction or not episode.U.shape[1] or b - a == 1:
-                places.append(Place(e, a + 1, b + 1))
-                around = [abs(X[a, smooth] - X[a - 1, smooth])]
-                if b + 2 < len(X):
-                    around.append(abs(X[b + 2, smooth] - X[b + 1, smooth]))
-                step = float(np.mean(around))
-                if step > 0:
-                    travels.append(abs(X[b + 1, smooth] - X[b, smooth]) / step / (b - a + 1))
-    lengths = [p.last - p.first for p in places]
+    holds = list(_list_holds(log, live))
+    places, lengths = tuple(place for place, *_ in holds), [place.last - place.first for place, *_ in holds]
     if not places or (len(places) < 3 and max(lengths) < 3):
         return
-    rows, longest, where = sum(lengths), max(lengths), list_places(tuple(places))
+    rows, longest, where = sum(lengths), max(lengths), list_places(places)
+    again, travels = sum(repeated for _, repeated, _ in holds), [far for *_, far in holds if np.isfinite(far)]
     if longest > 2 or not travels or float(np.median(travels)) > 0.72 or 2 * again < len(places):
         yield LogFault(
             "held samples",
             f"no sensor moves in {rows} rows, up to {longest} in sequence, though the plant does: {where}",
             "leave these rows out: the logger held its last values",
-            places=tuple(places),
+            places=places,
         )
     else:
         yield LogFault(
             "rows twice",
             f"{rows} rows repeat the row before them, and the plant goes on from there: {where}",
             "drop the second of each pair",
-            places=tuple(places),
+            places=places,
         )
+
+
+def _list_holds(log: Log, live: list[int]) -> Iterator[tuple[Place, bool, float]]:
+    """Yield rows in which no sensor moves, whether the inputs repeat too, and the step after in shares of usual ones.
+
+    That step is of the smoothest state, for each row that it may have missed; NaN where the state rests.
+    """
+    limits, by_chance = find_sensor_limits(log), _repeat_by_chance(log, live)
+    smooth = _find_smoothest_state(log, live)
+    for e, episode in enumerate(log.data):
+        X, U, steps = episode.X, episode.U, np.abs(np.diff(episode.X[:, smooth]))
+        for a, b in find_stretches((np.diff(X[:, live], axis=0) == 0).all(axis=1)):
+            at_limits = all(X[a, i] in limits.get(i, ()) for i in live)
+            if b >= len(U) or a == 0 or at_limits or (by_chance and b - a == 1):
+                continue
+            again = np.array_equal(U[b - 1], U[b])
+            if again or (np.ptp(U[a:b], axis=0) > 0).any() or not U.shape[1] or b - a == 1:
+                usual = float(np.mean(np.append(steps[a - 1], steps[b + 1 : b + 2])))
+                yield Place(e, a + 1, b + 1), again, steps[b] / usual / (b - a + 1) if usual > 0 else np.nan
 
 
 def _repeat_by_chance(log: Log, live: list[int]) -> bool:
@@ -416,9 +421,9 @@ def find_whole_turns(log: Log) -> dict[int, float]:
     for i in range(log.data.nx):
         changes = np.abs(log.changes[:, i])
         for turn in (2 * np.pi, 360.0):
-            find_jumps = np.abs(changes - turn) < 0.25 * turn
-            small = np.median(changes) < 0.15 * turn and np.mean(changes[~find_jumps] > 0.5 * turn) < 0.001
-            if find_jumps.any() and small and 0.8 * turn < np.ptp(log.X[:, i]) < 1.02 * turn:
+            wrapped = np.abs(changes - turn) < 0.25 * turn
+            small = np.median(changes) < 0.15 * turn and np.mean(changes[~wrapped] > 0.5 * turn) < 0.001
+            if wrapped.any() and small and 0.8 * turn < np.ptp(log.X[:, i]) < 1.02 * turn:
                 whole_turns[i] = turn
     return whole_turns
 
