@@ -12,6 +12,7 @@ References
 Ljung, "System Identification", 2nd ed., 1999, sections 4.2 and 10.3 (extended least squares).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
@@ -21,7 +22,7 @@ from jaxtyping import Float, Int
 
 from koopmpc.base.text import to_percent
 from koopmpc.base.values import Value
-from koopmpc.data.episodes import Episodes, episodes_of
+from koopmpc.data.episodes import Episode, Episodes, episodes_of
 from koopmpc.lifting.base import strip_unit
 
 
@@ -173,27 +174,31 @@ def _stack_rows(data: Episodes) -> _Rows | None:
     x_mean, x_size = X.mean(axis=0), np.where(X.std(axis=0) > 0, X.std(axis=0), 1.0)
     wide = np.flatnonzero(np.ptp(X, axis=0) > 2 * np.pi)
     u_mean, u_size = U[:, moving].mean(axis=0), U[:, moving].std(axis=0)
-    long = [e for e in data if len(e) > past]
-    share = max(sum(len(e) for e in long) / _LIMITS.rows, 1.0)
     parts: list[tuple[np.ndarray, ...]] = []
     count = 0
-    for e in long if len(long) < 50 else long[:: int(np.ceil(share))]:
+    for e, k in _choose_rows(data, past):
         Z, V = (e.X - x_mean) / x_size, (e.U[:, moving] - u_mean) / u_size
-        pieces = 1 if len(long) >= 50 or share == 1.0 else 8
-        kept = (len(e) if pieces == 1 else int(len(e) / share)) // pieces
-        for low in np.linspace(0, len(e) - kept, pieces):
-            k = np.arange(int(low) + past, int(low) + max(kept, past + 1))
-            k = k[k < len(e)]
-            if not len(k):
-                continue
-            before = np.hstack([column for i in range(1, past + 1) for column in (Z[k - i], V[k - i])])
-            parts.append((Z[k], Z[k + 1], V[k], before, np.r_[-1, np.arange(count, count + len(k) - 1)]))
-            count += len(k)
+        before = np.hstack([column for i in range(1, past + 1) for column in (Z[k - i], V[k - i])])
+        parts.append((Z[k], Z[k + 1], V[k], before, np.r_[-1, np.arange(count, count + len(k) - 1)]))
+        count += len(k)
     if count < _LIMITS.least:
         return None
     now, after, inputs, before, follows = (np.concatenate(column) for column in zip(*parts, strict=True))
     width = data.nx + int(moving.sum())
     return _Rows(now, after, inputs, before, wide, x_mean, x_size, follows, min(_LIMITS.few, past) * width)
+
+
+def _choose_rows(data: Episodes, past: int) -> Iterator[tuple[Episode, Int[np.ndarray, " n"]]]:
+    """Yield the rows of evenly spread stretches, with so many rows before each."""
+    long = [e for e in data if len(e) > past]
+    share = max(sum(len(e) for e in long) / _LIMITS.rows, 1.0)
+    pieces = 1 if len(long) >= 50 or share == 1.0 else 8
+    for e in long if len(long) < 50 else long[:: int(np.ceil(share))]:
+        kept = (len(e) if pieces == 1 else int(len(e) / share)) // pieces
+        for low in np.linspace(0, len(e) - kept, pieces).astype(int):
+            k = np.arange(low + past, min(low + max(kept, past + 1), len(e)))
+            if len(k):
+                yield e, k
 
 
 def _find_innovations(rows: _Rows) -> tuple[Float[np.ndarray, "M nx"], Float[np.ndarray, " nx"]]:

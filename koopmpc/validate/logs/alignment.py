@@ -9,6 +9,7 @@ information from one sensor to another.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -50,8 +51,7 @@ class _Limits:
 _LIMITS = _Limits()
 
 
-@dataclass(frozen=True)
-class Shift:
+class Shift(NamedTuple):
     """State or input `column` (inputs follow the states) is read `steps` rows later, or earlier if negative.
 
     A sensor is never ahead of the plant, so a state is only read later. An earlier reading would be no evidence, since
@@ -116,9 +116,13 @@ def is_better(
     log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"], least: float = _LIMITS.gain
 ) -> bool:
     """Return True if `other` predicts better than `E` by more than chance, and in nearly all parts of the log."""
-    parts = zip(np.array_split(E, _LIMITS.blocks), np.array_split(other, _LIMITS.blocks), strict=True)
-    agree = sum(compute_gain(log, a, b) > 0 for a, b in parts)
+    agree = sum(compute_gain(log, a, b) > 0 for a, b in _pair_parts(E, other))
     return compute_gain(log, E, other) > max(least, _LIMITS.sure / len(E)) and agree >= _LIMITS.blocks - 1
+
+
+def _pair_parts(E: np.ndarray, other: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the parts of the log that have to agree: rows of both residuals."""
+    return [*zip(*(np.array_split(rows, _LIMITS.blocks) for rows in (E, other)), strict=True)]
 
 
 def find_late_signals(log: Log) -> Iterator[LogFault]:
@@ -159,20 +163,18 @@ def _find_best_shift(
     if not scores:  # the only signal that can be late has its shift
         return None
     best = max(scores, key=lambda shift: scores[shift] * (_LIMITS.preference if shift[0].column >= nx else 1.0))
-    rivals = {shift: score for shift, score in scores.items() if shift[0].column != best[0].column}
     if best[0].column >= nx and not _replaces_present_input(log, accepted, best, errors[best]):
-        sensors = {shift: score for shift, score in scores.items() if shift[0].column < nx}
-        if not sensors:
+        scores = {shift: score for shift, score in scores.items() if shift[0].column < nx}
+        if not scores:
             return None
-        best = max(sensors, key=sensors.__getitem__)  # the input seems late only because a sensor is
-        rivals = {shift: score for shift, score in sensors.items() if shift[0].column != best[0].column}
+        best = max(scores, key=scores.__getitem__)  # the input seems late only because a sensor is
+    rivals = {shift: score for shift, score in scores.items() if shift[0].column != best[0].column}
     if best[0].column < nx:
         rival_gain = max((compute_gain(log, E, errors[shift]) for shift in rivals), default=0.0)
         sure = _is_sensor_late(log, best[0], E, errors[best], max(rivals.values(), default=0.0), rival_gain)
     else:
-        neighbours = [tuple(Shift(part.column, part.steps + step) for part in best) for step in (-1, 1)]
-        neighbour_scores = [scores[shift] for shift in neighbours if shift in scores]
-        sure = is_better(log, E, errors[best]) and max(neighbour_scores, default=0.0) < _LIMITS.peak * scores[best]
+        near = max(scores.get(tuple(Shift(i, steps + more) for i, steps in best), 0.0) for more in (-1, 1))
+        sure = is_better(log, E, errors[best]) and near < _LIMITS.peak * scores[best]
     alike = {shift[0].column for shift, score in rivals.items() if score > _LIMITS.clear * scores[best]}
     return (best, errors[best], sorted(i for i in alike if i < nx)) if sure else None
 
@@ -218,8 +220,7 @@ def _is_sensor_late(
         return True
     if gain < _LIMITS.own or rival_score > _LIMITS.clear_own * gain or (shift.steps == 1 and misfit > 1):
         return False
-    parts = zip(np.array_split(E, _LIMITS.blocks), np.array_split(other, _LIMITS.blocks), strict=True)
-    return all(_compute_own_gain(log, shift, a, b) > _LIMITS.even * gain for a, b in parts)
+    return all(_compute_own_gain(log, shift, a, b) > _LIMITS.even * gain for a, b in _pair_parts(E, other))
 
 
 def _find_shift_by_one_row(log: Log) -> Shift | None:
@@ -240,8 +241,8 @@ def _find_shift_by_one_row(log: Log) -> Shift | None:
     best, most = None, _LIMITS.own_one_row
     for i, steps in product(range(log.data.nx), range(1, _LIMITS.one_row_latest + 1)):
         other = align_rows(log, (Shift(i, steps),)).one_row_residuals(log)
-        pairs = zip(np.array_split(E[:, i], _LIMITS.blocks), np.array_split(other[:, i], _LIMITS.blocks), strict=True)
-        gains = [0.5 * float(np.log((np.mean(a**2) + 1e-20) / (np.mean(b**2) + 1e-20))) for a, b in pairs]
+        means = [[np.mean(part**2) + 1e-20 for part in pair] for pair in _pair_parts(E[:, i], other[:, i])]
+        gains = [0.5 * float(np.log(a / b)) for a, b in means]
         if np.median(gains) > most and min(gains) > _LIMITS.even * np.median(gains):
             best, most = Shift(i, steps), float(np.median(gains))
     return best

@@ -159,31 +159,36 @@ def measure_timing(log: Log) -> tuple[InputTiming, ...]:
             later[known], _ = _test_coefficients(beyond[:, known], _leave_out(more, rows.change))
     else:
         signs = np.zeros((0, log.data.nx))
-    found: list[InputTiming] = []
+    place = np.cumsum(moving) - 1  # of a moving input among them
+    timings: list[InputTiming] = []
     for j, name in enumerate(names):
         i = int(np.argmax(np.abs(t[j])))
         value = float(t[j, i])
-        if not moving[j]:
-            found.append(InputTiming(name, Timing.UNKNOWN, value, "its past predicts it, so no row shows its effect"))
-            continue
-        agree = signs[np.flatnonzero(moving).tolist().index(j), i] >= _LIMITS.blocks - 1
-        strong = value**2 > _LIMITS.strong * (len(rows.same) + value**2)
-        limits = _USUAL if strong or abs(value) <= _LIMITS.weak else _STRICT
-        if not (strong and _amplifies(rows, j, value)) and (why := _explain_feedback(rows, j, value, limits)):
-            found.append(InputTiming(name, Timing.UNKNOWN, value, why, feedback=True))
-        elif abs(value) < _LIMITS.weak:
-            found.append(InputTiming(name, Timing.NEXT_ROW, value, "its own row does not hold its effect"))
-        elif abs(value) < _LIMITS.sure:
-            found.append(InputTiming(name, Timing.UNKNOWN, value, f"its own row may hold its effect (t = {value:.3g})"))
-        elif not agree or np.abs(later[j]).max() > max(_LIMITS.later * abs(value), _LIMITS.weak):
-            why = "rows before it seem to hold its effect too" if agree else "parts of the log disagree"
-            found.append(InputTiming(name, Timing.UNKNOWN, value, why))
-        elif _follows_law(rows, j) and not _score_gain(rows, j, value) > _LIMITS.tells:
-            why = "a PID controller that answers to disturbances would move it in the same way"
-            found.append(InputTiming(name, Timing.UNKNOWN, value, why, feedback=True))
-        else:
-            found.append(InputTiming(name, Timing.SAME_ROW, value, f"its own row holds its effect (t = {value:.3g})"))
-    return tuple(found)
+        judged: tuple[Timing, str, bool] = Timing.UNKNOWN, "its past predicts it, so no row shows its effect", False
+        if moving[j]:
+            judged = _judge_input(rows, j, value, bool(signs[place[j], i] >= _LIMITS.blocks - 1), later[j])
+        timings.append(InputTiming(name, judged[0], value, *judged[1:]))
+    return tuple(timings)
+
+
+def _judge_input(
+    rows: _Rows, j: int, t: float, agree: bool, later: Float[np.ndarray, " nx"]
+) -> tuple[Timing, str, bool]:
+    """Return the timing of input j, the reason, and whether that is a feedback; parts of the log may `agree` on t."""
+    strong = t**2 > _LIMITS.strong * (len(rows.same) + t**2)
+    limits = _USUAL if strong or abs(t) <= _LIMITS.weak else _STRICT
+    if not (strong and _amplifies(rows, j, t)) and (why := _explain_feedback(rows, j, t, limits)):
+        return Timing.UNKNOWN, why, True
+    if abs(t) < _LIMITS.weak:
+        return Timing.NEXT_ROW, "its own row does not hold its effect", False
+    if abs(t) < _LIMITS.sure:
+        return Timing.UNKNOWN, f"its own row may hold its effect (t = {t:.3g})", False
+    if not agree or np.abs(later).max() > max(_LIMITS.later * abs(t), _LIMITS.weak):
+        why = "rows before it seem to hold its effect too" if agree else "parts of the log disagree"
+        return Timing.UNKNOWN, why, False
+    if _follows_law(rows, j) and not _score_gain(rows, j, t) > _LIMITS.tells:
+        return Timing.UNKNOWN, "a PID controller that answers to disturbances would move it in the same way", True
+    return Timing.SAME_ROW, f"its own row holds its effect (t = {t:.3g})", False
 
 
 def find_same_row_inputs(timings: tuple[InputTiming, ...]) -> Iterator[LogFault]:
