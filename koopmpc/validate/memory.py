@@ -195,7 +195,7 @@ def _choose_rows(data: Episodes, past: int) -> Iterator[tuple[Episode, Int[np.nd
     pieces = 1 if len(long) >= 50 or share == 1.0 else 8
     for e in long if len(long) < 50 else long[:: int(np.ceil(share))]:
         kept = (len(e) if pieces == 1 else int(len(e) / share)) // pieces
-        for low in np.linspace(0, len(e) - kept, pieces).astype(int):
+        for low in map(int, np.linspace(0, len(e) - kept, pieces)):
             k = np.arange(low + past, min(low + max(kept, past + 1), len(e)))
             if len(k):
                 yield e, k

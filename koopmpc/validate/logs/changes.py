@@ -209,7 +209,9 @@ def _fit_consensus(log: Log, segments: list[Place]) -> tuple[OneStepLaw | None, 
 
 def _list_changes(log: Log, law: OneStepLaw, segments: list[Segment]) -> Iterator[Change]:
     """Yield the changes of sign, order, unit, offset and sample time that a recorder may make."""
-    data, names, nx = log.data, [strip_unit(name) for name in log.names], log.data.nx
+    data, nx = log.data, log.data.nx
+    signals = (*data.states, *data.inputs)
+    names = [strip_unit(name) for name in signals]
 
     def edit(
         kind: str, says: str, columns: Sequence[int], sources: Sequence[int], factor: float = 1.0, by: float = 0.0
@@ -217,7 +219,7 @@ def _list_changes(log: Log, law: OneStepLaw, segments: list[Segment]) -> Iterato
         allowance = max(-float(np.log(abs(factor))), 0.0) if columns[0] < nx else 0.0
         undone = partial(_edit, list(columns), list(sources), factor, by)
         tuned = kind in ("unit change", "offset change")
-        return Change(kind, tuple(log.names[i] for i in columns), says, undone, allowance, tuned)
+        return Change(kind, tuple(signals[i] for i in columns), says, undone, allowance, tuned)
 
     for i, name in enumerate(names):
         yield edit("sensor sign" if i < nx else "input sign", f"{name} has the other sign", [i], [i], -1.0)
