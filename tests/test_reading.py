@@ -93,9 +93,9 @@ MOST = {  # files, returns
     "simulate_all": (15, 30),
     "record_all": (15, 54),
     "export_all": (21, 33),
-    "select_all": (34, 92),  # the leaderboard stands in a file of its own; feedback is looked for
-    "design_all": (115, 423),  # with fresh loops in machine code after the choice, and a monitor
-    "fit_all": (78, 272),  # koopmpc fit without a goal: reading, audit, choice, page
+    "select_all": (33, 92),  # the leaderboard stands in a file of its own; feedback is looked for
+    "design_all": (114, 423),  # with fresh loops in machine code after the choice, and a monitor
+    "fit_all": (77, 272),  # koopmpc fit without a goal: reading, audit, choice, page
 }
 
 

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence, Sized
 from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack, contextmanager, suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import islice
 from typing import Any, TypeVar, cast
 from urllib.parse import urlsplit
@@ -366,3 +366,8 @@ def _make_portable(error: Exception) -> Exception:
         error = KoopmpcError(f"{type(error).__name__}: {error}")
     error.add_note(f"in a worker:\n{trace}")
     return error
+
+
+def report_stage(progress: StageProgress | None, name: str) -> Progress | None:
+    """Return what is called with the progress of one stage."""
+    return None if progress is None else partial(progress, name)

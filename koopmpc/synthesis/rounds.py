@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.base.parallel import Workers
+from koopmpc.base.parallel import Workers, report_stage
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.synthesis.choice import DesignRow, average_ratios, choose_estimator, is_alike, measure_errors, rate_runs
 from koopmpc.synthesis.loops.conditions import LoopTest, prepare_test
@@ -16,7 +16,6 @@ from koopmpc.synthesis.loops.judging import Job, Outcome, judge_job
 from koopmpc.synthesis.loops.surrogates import choose_surrogates, is_unstable, rank_results
 from koopmpc.synthesis.options import DesignOptions
 from koopmpc.synthesis.search.cross_validation import Tried
-from koopmpc.synthesis.search.prepare import report_stage
 from koopmpc.synthesis.search.recipe import Recipe
 from koopmpc.synthesis.trials import PlannedTrials
 

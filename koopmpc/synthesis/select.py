@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
 from koopmpc.base.errors import FitWarning, refuse_moved
-from koopmpc.base.parallel import map_tasks
+from koopmpc.base.parallel import map_tasks, report_stage
 from koopmpc.data.angles import count_wraps
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
@@ -34,7 +34,7 @@ from koopmpc.synthesis.search.folds import Folds, make_folds, usual_horizon
 from koopmpc.synthesis.search.free_runs import judge_finalists, run_structure
 from koopmpc.synthesis.search.hidden_states import judge_hidden_states
 from koopmpc.synthesis.search.leaderboard import LeaderboardRow, Selection, choose_model, make_row
-from koopmpc.synthesis.search.prepare import PreparedData, list_delays, prepare_data, report_stage, take_out_noise
+from koopmpc.synthesis.search.prepare import PreparedData, list_delays, prepare_data, take_out_noise
 from koopmpc.synthesis.search.records import propose_structures, refine_structure
 from koopmpc.validate.scoring import AnyPredictor
 

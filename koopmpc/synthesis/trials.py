@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from koopmpc.base.errors import DataError
-from koopmpc.base.parallel import Workers
+from koopmpc.base.parallel import Workers, report_stage
 from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.composed import Present
 from koopmpc.lifting.state import State
@@ -18,7 +18,7 @@ from koopmpc.synthesis.search.candidates import Candidate, list_candidates
 from koopmpc.synthesis.search.cross_validation import LEAST, RIDGES, Trial, Tried, cross_validate
 from koopmpc.synthesis.search.folds import Folds, make_folds
 from koopmpc.synthesis.search.hidden_states import propose_hidden_states
-from koopmpc.synthesis.search.prepare import list_delays, report_stage
+from koopmpc.synthesis.search.prepare import list_delays
 from koopmpc.synthesis.task import LENGTHS, DesignTask
 from koopmpc.validate.memory import Memory
 

@@ -12,7 +12,6 @@ from koopmpc.models.moments.read import second_moments
 from koopmpc.models.records.hidden_structure import HiddenStructure
 from koopmpc.synthesis.search.candidates import Candidate, relift_model
 from koopmpc.synthesis.search.cross_validation import Trial, cross_validate, fit_ridges, leave_one_out
-from koopmpc.synthesis.search.feedback import project_on_instruments, remove_feedback
 from koopmpc.synthesis.search.folds import select_fold
 from koopmpc.synthesis.search.free_runs import (
     FreeRun,
@@ -23,6 +22,7 @@ from koopmpc.synthesis.search.free_runs import (
 )
 from koopmpc.synthesis.search.hidden_states import judge_hidden_states
 from koopmpc.synthesis.search.leaderboard import choose_model
+from koopmpc.synthesis.search.prepare import project_on_instruments, remove_feedback
 from koopmpc.synthesis.search.records import is_late
 from koopmpc.validate.closed_loop import is_fed_back
 from tests.models.test_instruments import TRUTH, run_loop
@@ -330,7 +330,7 @@ def test_logs_of_a_bent_plant_stay_though_a_linear_model_would_gain_by_a_filter(
         logs.append(km.Episode(X=np.array([*X, x]), U=np.array(U)))
     data = km.Episodes(logs, 0.05)
     assert remove_feedback(data, None).episodes is data
-    monkeypatch.setattr("koopmpc.synthesis.search.feedback._bend", lambda _: km.State() + km.Constant())
+    monkeypatch.setattr("koopmpc.synthesis.search.prepare._bend", lambda _: km.State() + km.Constant())
     assert "as a filter sees them" in remove_feedback(data, None).sentence
 
 
