@@ -14,7 +14,7 @@ from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.values import Value, Viewing
 from koopmpc.estimate.gate import BRIDGED, ROUNDING, gate_graph
-from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel, find_undisturbed
+from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel
 from koopmpc.estimate.periodic import PeriodicObserver, find_harmonics
 from koopmpc.models.predictors import LinearPredictor
 from koopmpc.plants.routines import bind_interpreter
@@ -145,7 +145,7 @@ class DisturbanceObserver(Viewing, Measured):
         own = self._model
         saturates = own.embedding is not None and own.embedding.rails is not None
         self._rails = own.embedding if saturates else None
-        self._sizes, self._known = (own.nz, own.nu, own.nw), find_undisturbed(model)
+        self._sizes = own.nz, own.nu, own.nw
         lift = None if self.lift is None else self.lift.function
         self._rule = _rule(self._sizes, self.ny, self._known, (gain, reach), lift)
         self._memory, self._C = np.zeros(self._rule.numel_in(2)), np.zeros(self.ny * own.nz)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
@@ -90,12 +90,6 @@ class LiftedModel:
             z_next += model.E.dot(w)
         z_next += d
         return z_next
-
-
-def find_undisturbed(model: LinearPredictor | StateModel) -> Bool[np.ndarray, " nz"]:
-    """Return which entries of z have no disturbance: the Constant, or the past of a state that is not lifted."""
-    entries = np.arange(model.nz)
-    return entries == model.lifting.constant_index if isinstance(model, LinearPredictor) else entries >= model.ny
 
 
 def state_model(model: LinearPredictor | StateModel) -> StateModel:
@@ -216,6 +210,8 @@ class Measured(Gated):
         self.z: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.d: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.lift = None if model.lifting is None else buffer_lifting(model.lifting)
+        entries = np.arange(model.nz)  # the Constant has no disturbance, nor the past of a state that is not lifted
+        self._known = entries >= model.ny if model.lifting is None else entries == model.lifting.constant_index
 
     def reset(self, x0: ArrayLike | None = None) -> None:
         """Forget d and the past; x0 will come as the first measurement."""

@@ -11,7 +11,7 @@ from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError
 from koopmpc.data.episodes import Episodes, episodes_of
-from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel, find_undisturbed
+from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel
 from koopmpc.models.predictors import LinearPredictor
 
 PERIODS = 3.0  # harmonics are learned over the last so many periods
@@ -48,7 +48,7 @@ class PeriodicObserver(Measured):
 
     def __init__(self, model: LinearPredictor | StateModel, turns: Float[np.ndarray, " h"]) -> None:
         super().__init__(model)
-        self._turns, self._unknown = turns, np.where(find_undisturbed(model), 0.0, 1.0)
+        self._turns, self._unknown = turns, np.where(self._known, 0.0, 1.0)
         self._forget = float(np.exp(-1 / max(PERIODS * 2 * np.pi / turns[0], SHORTEST)))
         self.reset()
 
