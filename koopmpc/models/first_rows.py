@@ -84,6 +84,7 @@ def estimate_start(
     else:
         course = _PointCourse(model, usual, spread, reach)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def explain(w: Float[np.ndarray, "1 n"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the residuals of the start v̄ + L w, their derivative, and the state behind the rows."""
         v, D = course.mean + course.factor @ w[0], course.factor
@@ -96,7 +97,7 @@ def estimate_start(
             slopes.append((course.C @ D / noise[:, None])[told])
             if k < len(moves):
                 v, D = course.advance(v, moves[k]), course.slope(v, moves[k]) @ D
-                if not (np.abs(v) < _FAR * course.reach).all():
+                if not (np.abs(v) < _FAR * course.reach).all() or not np.isfinite(D @ D.T).all():
                     return np.full(1, np.inf), np.zeros((1, len(w[0]))), v
         return np.concatenate(gaps), np.vstack(slopes), v
 

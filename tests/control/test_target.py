@@ -177,7 +177,9 @@ def test_sines_and_ramps_go_on(period, phase, slope, offset, size):
 def test_rows_that_rest_or_obey_no_recurrence_do_not_go_on():
     rng = np.random.default_rng(0)
     step = np.repeat([0.0, 1.0], [9, 6])
-    for column in (np.ones(15), step, rng.uniform(size=15), 1.2 ** np.arange(15)):
+    for resting in (np.ones(15), step):
+        assert extend_rows(resting[:, None]) is None
+    for column in (rng.uniform(size=15), 1.2 ** np.arange(15)):
         assert extend_rows(column[:, None]).rows.shape == (0, 1)
     assert extend_rows(np.column_stack([np.sin(np.arange(15)), rng.uniform(size=15)])).rows.shape == (0, 2)
     assert extend_rows(np.arange(5.0)[:, None]).rows.shape == (0, 1)  # too few rows to tell

@@ -103,3 +103,6 @@ def test_what_tells_no_start_is_refused_in_a_sentence():
         km.identify.estimate_start(model, np.zeros((0, 1)), np.zeros((0, 1)))
     with pytest.raises(km.errors.ShapeError, match="U has shape"):
         km.identify.estimate_start(model, [[0.0], [0.0]], [[0.0], [0.0]])
+    grows = km.edmd(km.Episodes([km.Episode(X=1.5 ** np.arange(8.0)[:, None], U=np.zeros((7, 0)))], 0.1), km.State())
+    with pytest.raises(km.errors.DataError, match="overflows; pass fewer"):
+        km.identify.estimate_start(grows, np.zeros((2500, 1)), np.zeros((2499, 0)))

@@ -101,7 +101,7 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
   const koopmpc_real *last = s->reference + STEPS * RN, *sx = koopmpc_rest_size, *su = koopmpc_rest_size + NX;
   koopmpc_real at[KOOPMPC_LOCAL], *A = at + LOCAL_A, *B = at + LOCAL_B, *J = at + LOCAL_J;
   koopmpc_real S[GOAL * NX], SA[GOAL * NX], SB[GOAL * NV], R[NV * NV], inner[NV * NV], inverse[NV * NV], gain[NV * NX];
-  koopmpc_real K[NV * NX], BK[NX * NX], weighed[RN * NX], seen[RN * NX], push[NX * RN], held[NX * RN], back[NX * GOAL];
+  koopmpc_real K[NV * NX], BK[NX * NX], weighed[RN * NX], push[NX * RN], held[NX * RN], back[NX * GOAL];
   koopmpc_real H[LEAST * NX], T[LEAST * (RN + LEAST)], by[LEAST * RN];
   koopmpc_real p[NX], next[NX], constant[NX], rest_input[NV], power[NX * NX], squared[NX * NX], left[RN * NX];
   int moves = 0, drifts = 0, goes_on = 1;
@@ -136,7 +136,6 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
   koopmpc_multiply(gain, R, K, NV, NV, NX, 0);
   koopmpc_multiply(weighed, koopmpc_Q_root, J, RN, RN, NX, 0);
   koopmpc_multiply(push, weighed, koopmpc_Q_root, NX, RN, RN, 1);
-  koopmpc_multiply(seen, koopmpc_Q_root, weighed, RN, RN, NX, 1);
   koopmpc_multiply(held, gain, by + NX * RN, NX, NV, RN, 1);
   for (int i = 0; i < NV; i++) rest_input[i] = KOOPMPC_HOLDS ? 0 : end[TARGET_U + i] / su[i];
   koopmpc_multiply(constant, gain, rest_input, NX, NV, 1, 1);
@@ -156,10 +155,12 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
     }
     koopmpc_copy(p, next, NX);
   }
-  koopmpc_multiply(left, seen, power, RN, NX, NX, 0);
-  if (!(koopmpc_dot(left, left, RN * NX) <= KOOPMPC_LEFT * KOOPMPC_LEFT * koopmpc_dot(seen, seen, RN * NX)) ||
-      !koopmpc_usable(p, NX)) {
-    koopmpc_weigh_row(end, koopmpc_Q_root); /* errors of the tracked outputs do not come to rest: no tail */
+  koopmpc_multiply(left, weighed, power, RN, NX, NX, 0);
+  int rests = koopmpc_usable(p, NX);
+  for (int j = 0; j < RN * NX; j += NX)
+    rests &= koopmpc_dot(left + j, left + j, NX) <= KOOPMPC_LEFT * KOOPMPC_LEFT * koopmpc_dot(weighed + j, weighed + j, NX);
+  if (!rests) {
+    koopmpc_weigh_row(end, koopmpc_Q_root); /* errors of a tracked output do not come to rest: no tail */
     return;
   }
   if (!goes_on) { /* the last row takes the place of what the equilibrium gives */

@@ -179,7 +179,7 @@ int koopmpc_is_free(koopmpc_state *s, const koopmpc_real *row);
 /** Weigh the end of the horizon by a matrix alone: |root (of(x_N) - r)|^2, r the row of the target. */
 void koopmpc_weigh_row(koopmpc_real *target, const koopmpc_real *root);
 
-/** Move the end's target to where a reference that goes on as it moved asks for it; one that rests moves nothing. */
+/** Move the end to where a reference that moves at its last row asks for it, or drop its tail; one that rests moves nothing. */
 void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end);
 
 /** Move the equilibrium of a target, and its cost, to where x = F(x, u) + e. */

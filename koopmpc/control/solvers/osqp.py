@@ -145,9 +145,9 @@ class OSQP(QPSolver):
             super().update(qp)
             return
         self._hold(qp)
-        self._solver.update_data_vec(q=qp.q, l=self.low, u=self.high)
         if self._solver.update_data_mat(P_x=P, P_i=None, A_x=A, A_i=None):
             raise DataError("OSQP refuses the new matrices; pass a convex QP, P ⪰ 0")
+        self._solver.update_data_vec(q=qp.q, l=self.low, u=self.high)  # last: new matrices would scale q once more
 
     def _forget(self) -> None:
         """Forget the step size ρ that earlier solves adapted: the same problem then has the same iterates."""

@@ -21,8 +21,8 @@ RESTS = 3  # equal rows at the end of a preview that say that the reference rest
 STILL = 1e-12  # share of the largest row below which a column does not move
 TERMS = 1e-11  # directions of a column's past below this share of the largest have no coefficient
 ROUNDING = 1e-13  # directions of the inputs below this share of the largest have no gain
-REST_STEPS = 1024  # steps in which the loop behind the end brings errors of the tracked outputs to rest
-LEFT = 0.1  # share of these errors that may be left then
+REST_STEPS = 2**20  # steps, slow ones too, in which the loop behind the end brings each tracked output to rest
+LEFT = 0.1  # share of an output's errors that may be left then
 SEEN = 1e-5  # directions of x_N below this share of the largest cost nothing at the end
 
 
@@ -123,20 +123,21 @@ def shift_end(
     nx = len(at.A)
     sx, su = np.split(size, [nx])
     A, B, J = at.A * sx / sx[:, None], at.B * su / sx[:, None], at.J * sx
-    Q, R = weights[0], weights[1] * np.outer(su, su)
+    Q_root, R = weights[0], weights[1] * np.outer(su, su)
     S = (end.M @ at.J + end.L) * sx
     PB = S.T @ (S @ B)
     K: Float[np.ndarray, "nu nx"] = np.asarray(np.linalg.lstsq(R + B.T @ PB, PB.T @ A, rcond=ROUNDING)[0])
     D = rows - at.of
     wanted = np.tile(-u / su, (len(D), 1)) if held is None else D @ (held / su[:, None]).T
-    p, closed, seen = D @ Q @ J - wanted @ (R @ K), A - B @ K, Q @ J
+    closed, seen = A - B @ K, Q_root @ J
+    p = D @ Q_root.T @ seen - wanted @ (R @ K)
     with np.errstate(over="ignore", invalid="ignore"):
-        left = np.linalg.norm(seen @ np.linalg.matrix_power(closed, REST_STEPS))
+        left = np.linalg.norm(seen @ np.linalg.matrix_power(closed, REST_STEPS), axis=1)
         while len(p) > 1:  # Σ closedᵀᵏ p_k: neighbours at once
             if len(p) % 2:
                 p = np.vstack([p, np.zeros(nx)])
             p, closed = p[::2] + p[1::2] @ closed, closed @ closed
-    if not (left <= LEFT * np.linalg.norm(seen) and np.abs(p).max() < checks.HUGE):
+    if not ((left <= LEFT * np.linalg.norm(seen, axis=1)).all() and np.abs(p).max() < checks.HUGE):
         return None
     return end._replace(m=end.m + (p[0] @ np.linalg.pinv(S, rcond=SEEN) if len(D) > 1 else end.M @ D[0]))
 
@@ -264,7 +265,7 @@ class StageAim:
         goes_on = not beyond.drifts or can_drift(at, followed, o.Q_root, R)
         rows = np.vstack([R[-1], beyond.rows]) if goes_on else R[-1:]
         held = followed[len(rest.x) :] if self.targets.holds else None
-        moved = shift_end(cost, rest.u, at, (o.Q, o.R), search.size, rows, held)
+        moved = shift_end(cost, rest.u, at, (o.Q_root, o.R), search.size, rows, held)
         return self._weigh_last(R, cost, trajectory=True) if moved is None else moved
 
 

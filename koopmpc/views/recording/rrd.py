@@ -251,12 +251,11 @@ class LogColumns:
         cut = data[-12:-4] != _END and whole_messages < len(data)
         if check is not None and not cut:
             place = start + len(_MARK)
-            parts = memoryview(data)[:place], _BLANK, memoryview(data)[place + len(_BLANK) :]
-            if checksum(*parts) != int(check.group(1), 16):
+            if checksum(memoryview(data)[:place], _BLANK, memoryview(data)[place + len(_BLANK) :]) != int(check[1], 16):
                 raise LogError(f"{path} is damaged: it no longer holds what was written; take another copy")
         self._parts: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
         copied = data[:whole_messages] if cut else b""
-        del data
+        del data, check
         with _copied(path, copied) as whole:
             try:
                 self._read(whole, entities)
