@@ -9,6 +9,7 @@ import threading
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from textwrap import dedent
 from typing import Any
@@ -345,3 +346,13 @@ def test_a_scheduler_that_dies_is_told(tmp_path: Path) -> None:
         results = map_tasks(tasks.kill_at_three, [(process.pid, i) for i in range(10)], scheduler=address)
         with pytest.raises(km.KoopmpcError, match=rf"task \d+, .*: the Dask scheduler at {address} has ended"):
             list(results)
+
+
+def test_a_task_that_dask_forgot_with_its_scheduler_is_told(tmp_path: Path) -> None:
+    """What is sent while the scheduler ends may never be answered, nor cancelled."""
+    with scheduler_process(tmp_path) as (_process, address), Workers(scheduler=address) as workers:
+        executor, *_ = workers._open()
+        executor.submit = lambda *_: Future[bytes]()
+        executor._client.status = "closed"  # as when the client has ended by itself
+        with pytest.raises(km.KoopmpcError, match=rf"task 0, .*: the Dask scheduler at {address} has ended"):
+            list(workers.run(tasks.square, [1, 2], ahead=2))

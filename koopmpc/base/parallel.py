@@ -13,7 +13,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence, Sized
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import BrokenExecutor, Future, wait
 from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache, partial
 from itertools import islice
@@ -35,10 +35,12 @@ _AHEAD = 2  # for each worker this many tasks may be under way, or wait for thei
 _TRIES = 3  # name a task that killed its worker this many times while it ran alone
 _PATIENCE = 30.0  # raise an error if the cluster has no worker, or its scheduler no answer, for this time [s]
 _ANSWER = 10.0  # raise an error if nothing listens at the scheduler's address, or it says nothing, for this time [s]
+_LOOK = 1.0  # look whether the scheduler has ended each time that no answer came for this time [s]
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _KEEP_MODELS = {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}  # loky restarts a worker whose memory grows by more [B]
 _KILLS = ": each worker that ran it died; run it with workers=1 to see why, or give the workers more memory"
 _UNSENDABLE = (AttributeError, TypeError, pickle.PicklingError)
+_Pool = tuple[Any, Callable[[], int], Callable[[], bool]]
 
 
 def map_tasks(
@@ -99,7 +101,7 @@ class Workers:
         self._workers = None if workers is None else checks.count(workers, "workers")
         self._scheduler = None if scheduler is None else check_scheduler(scheduler, workers)
         self._opened = ExitStack()
-        self._pool: tuple[Any, Callable[[], int]] | None = None
+        self._pool: _Pool | None = None
 
     def __enter__(self) -> "Workers":
         return self
@@ -170,8 +172,8 @@ class Workers:
             if waiting:  # nobody waits for the tasks under way any more
                 self.close()
 
-    def _open(self) -> tuple[Any, Callable[[], int]]:
-        """Return the executor, and what counts its workers."""
+    def _open(self) -> _Pool:
+        """Return the executor, what counts its workers, and what says whether it has ended."""
         if self._pool is None:
             processes = _start_processes(self._workers or 1)
             opening = processes if self._scheduler is None else _join_cluster(self._scheduler, self._workers)
@@ -189,6 +191,9 @@ class Workers:
     def _wait(self, future: Future[bytes], name: str, code: bytes, sent: bytes) -> bytes:
         """Return the answer; what the function raised is in it, so an exception is one of the workers."""
         try:
+            while not wait([future], timeout=_LOOK).done:
+                if self._pool is not None and self._pool[2]():  # Dask forgets what was sent while its scheduler ended
+                    raise ConnectionError("the scheduler has ended")
             return future.result()
         except BrokenExecutor:
             self.close()
@@ -219,14 +224,14 @@ def check_scheduler(scheduler: str, workers: int | None) -> str:
 
 
 @contextmanager
-def _start_processes(workers: int) -> Generator[tuple[Any, Callable[[], int]]]:
+def _start_processes(workers: int) -> Generator[_Pool]:
     """Start processes that inherit a blocked Ctrl-C, which is the parent's to answer, and one BLAS thread."""
     from loky import ProcessPoolExecutor
 
     executor: Any = ProcessPoolExecutor(workers, initializer=_watch_parent, env={**_ONE_THREAD, **_KEEP_MODELS})
     try:
         call_uninterrupted(lambda: executor.submit(os.getpid))
-        yield executor, lambda: workers
+        yield executor, lambda: workers, lambda: False
     except BaseException:  # nobody waits for the tasks under way
         executor.shutdown(wait=True, kill_workers=True)
         raise
@@ -242,7 +247,7 @@ def _run_alone(name: str, code: bytes, sent: bytes) -> bytes:
         Each worker died while it ran this task, or while it started.
     """
     for _ in range(_TRIES):
-        with _start_processes(1) as (executor, _count):
+        with _start_processes(1) as (executor, *_):
             try:
                 executor.submit(os.getpid).result()
             except BrokenExecutor as error:
@@ -255,7 +260,7 @@ def _run_alone(name: str, code: bytes, sent: bytes) -> bytes:
 
 
 @contextmanager
-def _join_cluster(scheduler: str, workers: int | None) -> Generator[tuple[Any, Callable[[], int]]]:
+def _join_cluster(scheduler: str, workers: int | None) -> Generator[_Pool]:
     """Connect to a Dask cluster; a local one, which only this machine sees, is taken down after.
 
     Raises
@@ -294,14 +299,23 @@ def _join_cluster(scheduler: str, workers: int | None) -> Generator[tuple[Any, C
                 f"the cluster at {scheduler} has no worker after {_PATIENCE:g} s; start some with `dask worker ADDRESS`"
             ) from error
         executor = client.get_executor(pure=False)
-        opened.callback(executor.shutdown, wait=False)
+
+        def has_ended() -> bool:
+            return bool(client.status == "closed")
+
+        def end() -> None:
+            if has_ended():  # by itself: Dask would let its thread go on, unless the client is closed once more
+                client.status = "running"
+            else:
+                executor.shutdown(wait=False)
 
         def count_threads() -> int:
             with suppress(OSError):  # the scheduler has ended: the first result that is awaited says so
                 return max(sum(client.nthreads().values()), 1)
             return 1
 
-        yield executor, count_threads
+        opened.callback(end)
+        yield executor, count_threads, has_ended
 
 
 def _greet(address: str) -> None:
