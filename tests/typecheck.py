@@ -55,8 +55,6 @@ def _checked(what: Any = None, *, typechecker: Any = None) -> Any:
         if dataclasses.is_dataclass(what) and init is not None and not hasattr(init, "_checked"):
             what.__init__ = _checked(init)
         return what
-    for name in [name for name, hint in what.__annotations__.items() if hint is typing.Self]:
-        del what.__annotations__[name]  # beartype knows Self only in a class that it decorates
     if inspect.isgeneratorfunction(what) or any(isinstance(hint, str) for hint in what.__annotations__.values()):
         made = _jaxtyped(what, typechecker=beartyped)  # it leaves what is yielded and names in quotes unchecked
     else:

@@ -235,6 +235,7 @@ def test_logged_runs_on_the_plant_are_judged_told_and_those_of_another_controlle
 
 def test_runs_in_a_table_are_read_with_the_names_and_the_step_of_the_design(made, tmp_path, monkeypatch):
     """No name says which column is the input, and there is none of time: the design knows both."""
+    monkeypatch.chdir(tmp_path)
     saved, _ = load(made)
     named = km.Episodes(list(saved.evidence.logs), 0.1, ["p", "q"], ["s"])
     save_value(replace(saved, evidence=replace(saved.evidence, logs=named)), tmp_path / "design.npz")

@@ -11,6 +11,7 @@ from tests.commands import koopmpc
 
 
 def test_a_bench_runs_five_problems_and_with_all_every_shipped_one(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
     ran = []
     monkeypatch.setattr(
         "koopmpc.apps.cli.sweeps._sweep", lambda problems, *_, **__: ran.append([p.name for p in problems])

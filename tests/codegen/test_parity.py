@@ -576,7 +576,7 @@ def test_floats_answer_to_a_thousandth_of_the_range(name, steps):
 @pytest.mark.slow
 def test_floats_follow_a_swing_to_a_thousandth_of_the_range():
     tally = compare(KINDS["swing up"], 200, 2, "float")
-    assert np.median(tally.free + tally.others) <= FLOATS
+    assert np.quantile(tally.free + tally.others, 0.95) <= FLOATS
     assert tally.parted <= 0.05 * 200
 
 

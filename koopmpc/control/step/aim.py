@@ -113,8 +113,8 @@ def shift_end(
     u is the input of the equilibrium x_r. With x̃ = x − x_r and δ_k = r_k − of(x_r) the cost-to-go is
     x̃ᵀP x̃ − 2 p_Nᵀx̃ + …, so the target moves by P⁺p_N. Backward from p = 0 after the last row,
     p_k = JᵀQ δ_k + (A − B K)ᵀ p_{k+1} − Kᵀ R v_k. v_k is the input that costs nothing, from u_r on: `held` δ_k where
-    inputs count from the one that holds a row, else −u_r. P is the end's cost. `weights` are Q and R, `size` that of x
-    and u.
+    inputs count from the one that holds a row, else −u_r. P is the end's cost. `weights` are a root of Q, and R;
+    `size` that of x and u.
 
     References
     ----------
