@@ -13,7 +13,7 @@ from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import CertificateError, DataError
 from koopmpc.base.text import format_markdown_table, to_percent
 from koopmpc.base.values import Value
-from koopmpc.control.ask.checks import refuse_levels
+from koopmpc.control.ask.checks import FEEDBACK_FIELDS
 from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Interval, Limits
 from koopmpc.control.ask.terminal import TerminalFeedback, TerminalSet
@@ -352,7 +352,7 @@ class CertifiedFeedback(FeedbackLaw):
         checks.kind(certificate, "certificate", Certificate, "make one with km.certify")
         self.certificate, self.limits = certificate, limits
         sized = limits or certificate.limits or Limits()
-        refuse_levels(sized, "a CertifiedFeedback")
+        sized.require_known("a CertifiedFeedback", FEEDBACK_FIELDS)
         nu = len(certificate.inputs)
         box: Interval = sized.inputs(nu)
         super().__init__(certificate.dt, len(certificate.states), box, sized.rates(nu))

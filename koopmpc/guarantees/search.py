@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
-from koopmpc.control.ask.checks import refuse_levels
+from koopmpc.control.ask.checks import OUTPUT_FIELDS
 from koopmpc.control.ask.limits import Limits
 from koopmpc.guarantees.deviation import DeviationModel
 from koopmpc.guarantees.error_bounds import ErrorBound, ErrorPairs
@@ -55,9 +55,7 @@ def find_room(
     names = model.lifting.bound_states
     allowed = Limits() if limits is None else limits
     checks.kind(allowed, "limits", Limits, "or None for none")
-    refuse_levels(allowed, "a certificate")
-    if allowed.du_max is not None or allowed.du_min is not None:
-        raise DataError("limits of changes of the inputs are not part of a certificate; pass limits without du_max")
+    allowed.require_known("a certificate", ("u_min", "u_max", "du_slack", "rows", *OUTPUT_FIELDS))
     low, high = pairs.X.min(axis=0), pairs.X.max(axis=0)
     if region is not None:
         corners = checks.vector(region[0], "region", nx), checks.vector(region[1], "region", nx)

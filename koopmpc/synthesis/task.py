@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.base.values import Value
-from koopmpc.control.ask.checks import refuse_levels, refuse_priority
+from koopmpc.control.ask.checks import FEEDBACK_FIELDS
 from koopmpc.control.ask.cost import Cost, check_cost_and_limits, refuse_stage
 from koopmpc.control.ask.limits import Limits
 from koopmpc.data.episodes import Episodes
@@ -131,9 +131,8 @@ def check_task(
             "the limits have rows in time, and a design judges by one set; pass limits.base, and the rows to its "
             "controller: controller(y, reference, limits=controller.limits.with_bounds(u_max=rows))"
         )
-    refuse_levels(limits, "a design")
+    limits.require_known("a design", [name for name in FEEDBACK_FIELDS if name != "priority"])
     refuse_stage(cost, "a design")
-    refuse_priority(limits, "a design")
     nx, states = data.nx, data.states
     of = cost.of.bind(states)
     cost.matrices(of.nz, data.nu)

@@ -1,3 +1,5 @@
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
@@ -123,3 +125,38 @@ def test_the_range_of_the_data_is_that_of_uniform_data_about_their_mean():
     assert set(found) == {"a", "b", "ab"}  # c and the Constant do not move
     np.testing.assert_allclose([found["a"], found["b"]], [2, 0.5], rtol=0.05)
     assert found["ab"] == pytest.approx(np.sqrt(3) * product.std(), rel=1e-3)
+
+
+def test_a_field_of_limits_that_nobody_knows_is_refused():
+    """A limit that is added to `Limits` must not be ignored in silence by what keeps a part of them alone."""
+
+    @dataclass(frozen=True, eq=False)
+    class WithEnergy(km.Limits):
+        energy_max: float | None = None
+
+    plant = km.discretize(km.load_problem("pendulum").dynamics, 0.05)
+    data = km.collect(plant, [0, 0], km.Noise(-1, 1), episodes=2, steps=30)
+    model = km.LinearPredictor.local(plant, [0, 0], [0])
+    energy = km.Expressions(lambda x: [x[0] ** 2 + x[1] ** 2], ["energy"]).bind(("theta", "omega"))
+    cost, inputs = km.Cost(Q=1, R=1), {"u_min": -8, "u_max": 8}
+    acts = (
+        lambda limits: km.control.PID(1.0, dt=1.0, limits=limits),
+        lambda limits: km.LQR(model, cost, limits),
+        lambda limits: km.control.EigenfunctionLQR(
+            energy, km.Cost(Q=1, R=1, of=energy, u_target="zero"), limits, dt=0.05, B=[[0], [1]], eigenvalue=0.0
+        ),
+        lambda limits: km.metrics(
+            km.simulate(plant, km.LQR(model, cost), x0=[0.1, 0], reference=[0, 0], steps=3, limits=limits)
+        ),
+    )
+    for act in acts:
+        act(WithEnergy(**inputs))
+        with pytest.raises(km.errors.DataError, match=r"energy_max=2, which .* does not know"):
+            act(WithEnergy(**inputs, energy_max=2))
+    refused = WithEnergy(**inputs, energy_max=2)
+    for act in (
+        lambda: km.certify(model, data, refused, x=[0, 0], u=[0]),
+        lambda: km.design(data, cost, refused, horizon=3, reference=[0, 0]),
+    ):
+        with pytest.raises(km.errors.DataError, match=r"energy_max=2, which .* does not know"):
+            act()

@@ -204,19 +204,27 @@ def refuse_margin(limits: Any) -> None:
         )
 
 
-def refuse_priority(limits: Any, who: str) -> None:
-    """Raise where soft limits have priorities, for a choice that compares controllers by weights alone."""
-    if limits is not None and limits.priority is not None:
-        raise DataError(
-            f"the limits have a priority, which {who} does not know; weigh the limits with slack=, and make the"
-            " controller anew with the priority"
-        )
+INPUT_FIELDS = ("u_min", "u_max", "du_min", "du_max", "du_slack", "rows")
+OUTPUT_FIELDS = (
+    *("x_min", "x_max", "of", "y_min", "y_max", "slack", "margin", "capped", "priority"),
+    *("terminal", "terminal_slack"),
+)
+FEEDBACK_FIELDS = (*INPUT_FIELDS, *OUTPUT_FIELDS)
+"""Fields that a law with one feedback accepts: it clips inputs, and its docstring says that it sees no outputs."""
 
 
-def refuse_levels(limits: Any, who: str) -> None:
-    """Raise where inputs are on levels, for a law that does not search over them."""
-    if limits is not None and limits.levels is not None:
-        raise DataError(
-            f"the limits have levels={limits.levels}, which {who} does not keep;"
-            " take a KoopmanMPC, a LinearMPC, a BilinearMPC or a NonlinearMPC, or pass limits without levels"
-        )
+REFUSALS = {
+    "levels": (
+        "the limits have levels={value}, which {who} does not keep;"
+        " take a KoopmanMPC, a LinearMPC, a BilinearMPC or a NonlinearMPC, or pass limits without levels"
+    ),
+    "priority": (
+        "the limits have a priority, which {who} does not know; weigh the limits with slack=, and make the"
+        " controller anew with the priority"
+    ),
+    **dict.fromkeys(
+        ("du_min", "du_max"),
+        "limits of changes of the inputs are not part of {who}; pass limits without du_max",
+    ),
+}
+"""Field of `Limits` → why someone does not take it; any other field is said to be unknown."""

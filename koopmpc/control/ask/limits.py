@@ -1,8 +1,8 @@
 """Limits: the inequalities that every controller and every metric shares."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -22,7 +22,7 @@ from koopmpc.control.ask.bounds import half_width as half_width
 from koopmpc.control.ask.bounds import magnitude as magnitude
 from koopmpc.control.ask.bounds import preview_margin as preview_margin
 from koopmpc.control.ask.checks import BOUNDS as BOUNDS
-from koopmpc.control.ask.checks import ENDS, LIMIT_CHECKS, refuse_crossed_limits, refuse_margin
+from koopmpc.control.ask.checks import ENDS, LIMIT_CHECKS, REFUSALS, refuse_crossed_limits, refuse_margin
 from koopmpc.control.ask.levels import DwellByInput, InputLevels, LevelsByInput, build_levels
 from koopmpc.control.ask.terminal import HasTerminalSet, TerminalSet
 from koopmpc.lifting.base import Lifting, strip_unit
@@ -157,6 +157,14 @@ class Limits(Value):
                 lower, upper = (ordered.get(end, getattr(self, end)) for end in (low, high))
                 bounds.require_room(lower, upper, low, high, name, known[low[0]])
         return replace(self, **ordered, **entries)
+
+    def require_known(self, who: str, known: Collection[str]) -> None:
+        """Raise where a field is set that is not `known` to who asks, such as a field added since."""
+        refusal = "the limits have {name}={value}, which {who} does not know; leave {name} out"
+        for name, default in ((field.name, field.default) for field in fields(self) if field.name not in known):
+            value = getattr(self, name)
+            if value is not default and not (type(value) in (str, tuple) and value == default):
+                raise DataError(REFUSALS.get(name, refusal).format(name=name, value=value, who=who))
 
     @property
     def in_time(self) -> bool:

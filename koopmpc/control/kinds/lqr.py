@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError, ShapeError
-from koopmpc.control.ask.checks import refuse_levels
+from koopmpc.control.ask.checks import FEEDBACK_FIELDS
 from koopmpc.control.ask.cost import Cost, check_cost_and_limits
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.horizon import horizon_of
@@ -70,7 +70,7 @@ class LQR(FeedbackLaw):
         checks.kind(predictor, "predictor", LinearPredictor, advice)
         cost, known = check_cost_and_limits(cost, limits, predictor.states, predictor.inputs)
         track = lifted_tracking(predictor, cost, known.base)
-        refuse_levels(limits, "an LQR")
+        known.require_known("an LQR", FEEDBACK_FIELDS)
         self.predictor, self.cost, self.limits = predictor, track.cost, None if limits is None else known
         units, C = Units.of(predictor, track), track.tracked
         h = horizon_of(predictor, track, (1,), disturbed=False).in_units(units)
