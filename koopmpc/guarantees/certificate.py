@@ -15,7 +15,7 @@ from koopmpc.base.text import format_markdown_table, to_percent
 from koopmpc.base.values import Value
 from koopmpc.control.ask.checks import FEEDBACK_FIELDS
 from koopmpc.control.ask.cost import Cost
-from koopmpc.control.ask.limits import Interval, Limits
+from koopmpc.control.ask.limits import Interval, Limits, require_known
 from koopmpc.control.ask.terminal import TerminalFeedback, TerminalSet
 from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.move import Move, alone
@@ -352,7 +352,7 @@ class CertifiedFeedback(FeedbackLaw):
         checks.kind(certificate, "certificate", Certificate, "make one with km.certify")
         self.certificate, self.limits = certificate, limits
         sized = limits or certificate.limits or Limits()
-        sized.require_known("a CertifiedFeedback", FEEDBACK_FIELDS)
+        require_known(sized, "a CertifiedFeedback", FEEDBACK_FIELDS)
         nu = len(certificate.inputs)
         box: Interval = sized.inputs(nu)
         super().__init__(certificate.dt, len(certificate.states), box, sized.rates(nu))

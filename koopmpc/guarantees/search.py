@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
-from koopmpc.control.ask.checks import OUTPUT_FIELDS
-from koopmpc.control.ask.limits import Limits
+from koopmpc.control.ask.checks import FEEDBACK_FIELDS
+from koopmpc.control.ask.limits import Limits, require_known
 from koopmpc.guarantees.deviation import DeviationModel
 from koopmpc.guarantees.error_bounds import ErrorBound, ErrorPairs
 from koopmpc.guarantees.semidefinite import FeedbackProof, FeedbackTask, solve_feedback
@@ -55,7 +55,7 @@ def find_room(
     names = model.lifting.bound_states
     allowed = Limits() if limits is None else limits
     checks.kind(allowed, "limits", Limits, "or None for none")
-    allowed.require_known("a certificate", ("u_min", "u_max", "du_slack", "rows", *OUTPUT_FIELDS))
+    require_known(allowed, "a certificate", FEEDBACK_FIELDS - {"du_min", "du_max"})
     low, high = pairs.X.min(axis=0), pairs.X.max(axis=0)
     if region is not None:
         corners = checks.vector(region[0], "region", nx), checks.vector(region[1], "region", nx)

@@ -14,7 +14,7 @@ from koopmpc.base.values import Value
 from koopmpc.control.ask.checks import FEEDBACK_FIELDS
 from koopmpc.control.ask.cost import Cost, evaluate_stage
 from koopmpc.control.ask.levels import NEAR
-from koopmpc.control.ask.limits import SOFTENED, Interval, Limits
+from koopmpc.control.ask.limits import SOFTENED, Interval, Limits, require_known
 from koopmpc.control.plan.tracking import Sizes
 from koopmpc.loop.run import SECONDS, Run, bind_outputs
 
@@ -318,7 +318,7 @@ def beyond(run: Run) -> Float[np.ndarray, " T1"]:
 
 def _broken(run: Run, limits: Limits) -> tuple[Float[np.ndarray, "T n"], Float[np.ndarray, "T0 nu"]]:
     """Return by how much x_1 … x_T and their limited outputs are beyond their limits, and each change of the input."""
-    limits.require_known("metrics", (*FEEDBACK_FIELDS, "levels", "dwell", "level_steps"))
+    require_known(limits, "metrics", FEEDBACK_FIELDS | {"levels", "dwell", "level_steps"})
     values, changed = _stack(limits, _states(run)[1:], run.states), np.diff(run.U, axis=0)
     nx, (T0, nu) = len(run.states), changed.shape
     box, rates = limits.output_rows(nx, values.shape[1] - nx, 1, len(values)), limits.rate_rows(nu, 1, T0)

@@ -13,7 +13,7 @@ from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.base.values import Value
 from koopmpc.control.ask.checks import FEEDBACK_FIELDS
 from koopmpc.control.ask.cost import Cost, check_cost_and_limits, refuse_stage
-from koopmpc.control.ask.limits import Limits
+from koopmpc.control.ask.limits import Limits, require_known
 from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import evaluate_jacobians
@@ -131,7 +131,7 @@ def check_task(
             "the limits have rows in time, and a design judges by one set; pass limits.base, and the rows to its "
             "controller: controller(y, reference, limits=controller.limits.with_bounds(u_max=rows))"
         )
-    limits.require_known("a design", [name for name in FEEDBACK_FIELDS if name != "priority"])
+    require_known(limits, "a design", FEEDBACK_FIELDS - {"priority"})
     refuse_stage(cost, "a design")
     nx, states = data.nx, data.states
     of = cost.of.bind(states)

@@ -204,14 +204,13 @@ def refuse_margin(limits: Any) -> None:
         )
 
 
-INPUT_FIELDS = ("u_min", "u_max", "du_min", "du_max", "du_slack", "rows")
-OUTPUT_FIELDS = (
-    *("x_min", "x_max", "of", "y_min", "y_max", "slack", "margin", "capped", "priority"),
-    *("terminal", "terminal_slack"),
+FEEDBACK_FIELDS = frozenset(
+    (
+        *("u_min", "u_max", "du_min", "du_max", "du_slack", "rows", "x_min", "x_max", "of", "y_min", "y_max"),
+        *("slack", "margin", "capped", "priority", "terminal", "terminal_slack"),
+    )
 )
-FEEDBACK_FIELDS = (*INPUT_FIELDS, *OUTPUT_FIELDS)
-"""Fields that a law with one feedback accepts: it clips inputs, and its docstring says that it sees no outputs."""
-
+"""Fields of `Limits` that a law with one feedback takes: it clips inputs and, as it says, sees no outputs."""
 
 REFUSALS = {
     "levels": (

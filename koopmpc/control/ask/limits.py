@@ -158,14 +158,6 @@ class Limits(Value):
                 bounds.require_room(lower, upper, low, high, name, known[low[0]])
         return replace(self, **ordered, **entries)
 
-    def require_known(self, who: str, known: Collection[str]) -> None:
-        """Raise where a field is set that is not `known` to who asks, such as a field added since."""
-        refusal = "the limits have {name}={value}, which {who} does not know; leave {name} out"
-        for name, default in ((field.name, field.default) for field in fields(self) if field.name not in known):
-            value = getattr(self, name)
-            if value is not default and not (type(value) in (str, tuple) and value == default):
-                raise DataError(REFUSALS.get(name, refusal).format(name=name, value=value, who=who))
-
     @property
     def in_time(self) -> bool:
         """Whether a bound has a row for each step."""
@@ -389,3 +381,12 @@ def _box(low: Bound, high: Bound, low_name: str, high_name: str, n: int) -> Inte
         checks.vector(-np.inf if low is None else cast("ArrayLike", low), low_name, n, infinite=True),
         checks.vector(np.inf if high is None else cast("ArrayLike", high), high_name, n, infinite=True),
     )
+
+
+def require_known(limits: Limits, who: str, known: Collection[str]) -> None:
+    """Raise where a field of `limits` is set that is not `known` to who asks, such as a field added since."""
+    refusal = "the limits have {name}={value}, which {who} does not know; leave {name} out"
+    for name, default in ((field.name, field.default) for field in fields(limits) if field.name not in known):
+        value = getattr(limits, name)
+        if not (isinstance(value, type(default)) and value == default):
+            raise DataError(REFUSALS.get(name, refusal).format(name=name, value=value, who=who))

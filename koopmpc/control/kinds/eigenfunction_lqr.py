@@ -14,7 +14,7 @@ from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.control.ask.checks import FEEDBACK_FIELDS
 from koopmpc.control.ask.cost import Cost, check_cost_and_limits, refuse_stage, refuse_steps
-from koopmpc.control.ask.limits import Limits
+from koopmpc.control.ask.limits import Limits, require_known
 from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.move import Move, alone
 from koopmpc.control.program import Restored, SavedController
@@ -113,7 +113,7 @@ class EigenfunctionLQR(FeedbackLaw):
         kept = ca.if_else(ca.sum1(ca.fabs(x)) < HUGE, 1.0, np.nan) * x
         both = ca.densify(ca.vertcat(eigenfunction.symbolic(kept), self.law(kept, aim)))
         self._read = Buffered(ca.Function("u", [x, aim], [both], {"cse": True}))
-        sized.require_known("an EigenfunctionLQR", FEEDBACK_FIELDS)
+        require_known(sized, "an EigenfunctionLQR", FEEDBACK_FIELDS)
         super().__init__(checks.positive(dt, "dt", "s"), x.numel(), sized.inputs(nu), sized.rates(nu))
 
     @raise_swallowed()

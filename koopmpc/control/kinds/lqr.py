@@ -12,7 +12,7 @@ from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.control.ask.checks import FEEDBACK_FIELDS
 from koopmpc.control.ask.cost import Cost, check_cost_and_limits
-from koopmpc.control.ask.limits import Limits
+from koopmpc.control.ask.limits import Limits, require_known
 from koopmpc.control.horizon import horizon_of
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.move import Move, alone
@@ -70,7 +70,7 @@ class LQR(FeedbackLaw):
         checks.kind(predictor, "predictor", LinearPredictor, advice)
         cost, known = check_cost_and_limits(cost, limits, predictor.states, predictor.inputs)
         track = lifted_tracking(predictor, cost, known.base)
-        known.require_known("an LQR", FEEDBACK_FIELDS)
+        require_known(known, "an LQR", FEEDBACK_FIELDS)
         self.predictor, self.cost, self.limits = predictor, track.cost, None if limits is None else known
         units, C = Units.of(predictor, track), track.tracked
         h = horizon_of(predictor, track, (1,), disturbed=False).in_units(units)

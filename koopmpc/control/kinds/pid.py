@@ -18,7 +18,7 @@ from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError, ShapeError, refuse_moved
 from koopmpc.control.ask.checks import FEEDBACK_FIELDS
 from koopmpc.control.ask.cost import Cost, check_cost_and_limits
-from koopmpc.control.ask.limits import Limits
+from koopmpc.control.ask.limits import Limits, require_known
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.move import Move, alone
 from koopmpc.control.plan.tracking import lifted_tracking
@@ -115,7 +115,7 @@ class PID(FeedbackLaw):
                 checks.kind(given, name, (tuple, list, range, np.ndarray), "pass one index a loop")
         if limits is not None:
             checks.kind(limits, "limits", Limits, "pass km.Limits(u_min=…, u_max=…)")
-            limits.require_known("a PID", FEEDBACK_FIELDS)
+            require_known(limits, "a PID", FEEDBACK_FIELDS)
         nu = max(len(outputs) if outputs is not None else 1, *(g.size for g in gains))
         self.kp, self.ki, self.kd = (
             checks.vector(value, name, nu) for value, name in ((kp, "kp"), (ki, "ki"), (kd, "kd"))
